@@ -1,0 +1,404 @@
+"""What all algorithms share: configuration, validation, and the loop of sampling, replay and updates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any, ClassVar, Literal, Self
+
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.policy.policy import PolicySpec
+from ray.rllib.utils.annotations import override
+from ray.rllib.utils.checkpoints import Checkpointable
+from ray.rllib.utils.metrics import (
+    ENV_RUNNER_RESULTS,
+    ENV_RUNNER_SAMPLING_TIMER,
+    LEARNER_RESULTS,
+    LEARNER_UPDATE_TIMER,
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    REPLAY_BUFFER_ADD_DATA_TIMER,
+    REPLAY_BUFFER_SAMPLE_TIMER,
+    SYNCH_WORKER_WEIGHTS_TIMER,
+    TIMERS,
+)
+
+from rllib_maobs.envs.joint import Team
+from rllib_maobs.learner import Batch, JointLearner
+from rllib_maobs.modules import ACTIVATIONS, AgentModule, Exploration
+from rllib_maobs.replay import JointReplayBuffer
+from rllib_maobs.runner import JointEnvRunner, JointSample, make_env
+
+COMPONENT_REPLAY_BUFFER = "replay_buffer"
+CRITIC_STATES = ("observations", "world")
+# Minibatches are drawn several at a time, up to this many rows: one gather instead of many.
+_ROWS_PER_DRAW = 16_384
+
+
+def one_of(name: str, value: Any, legal: Collection[str]) -> None:
+    """Raises a ValueError that names the legal values unless the value is one of them."""
+    if value not in legal:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}, not {value!r}.")
+
+
+def in_range(name: str, value: Any, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
+    """Raises a ValueError that names the legal range unless the value is a finite number in it."""
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not number or not (low < value if open_low else low <= value) or value > high:
+        bounds = f"{'(' if open_low else '['}{low:g}, {'inf)' if high == math.inf else f'{high:g}]'}"
+        raise ValueError(f"{name} must be a finite number in {bounds}, not {value!r}.")
+
+
+def own_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
+    """The default policy mapping: every agent has a policy of its own, named like it."""
+    return agent_id
+
+
+class JointConfig(AlgorithmConfig):
+    """Settings of every algorithm here; the defaults are the paper's (table II), then its code base's.
+
+    Attributes:
+        name: The algorithm's name in scripts and tables.
+        uses_state: Whether its critic sees the global state.
+        team: The environment's agents and spaces; filled in by `validate()`.
+        module_ids: Every agent's policy, in the team's order; filled in by `validate()`.
+    """
+
+    name: ClassVar[str] = "joint"
+    uses_state: ClassVar[bool] = True
+    team: Team
+    module_ids: tuple[str, ...]
+
+    @override(AlgorithmConfig)
+    def __init__(self, algo_class: type | None = None) -> None:
+        super().__init__(algo_class=algo_class)
+        # Paper, table II.
+        self.gamma = 0.95
+        self.actor_lr: Any = 1e-3
+        self.critic_lr: Any = 1e-2
+        self.train_batch_size_per_learner = 256
+        self.exploration: dict[str, float] = {}
+        # The code base the paper grew from.
+        self.tau = 0.01
+        self.replay_buffer_capacity = 500_000
+        self.updates_per_env_step = 1.0
+        self.critic_state: Literal["observations", "world"] = "observations"
+        # Ours.
+        self.num_random_steps = 0
+        self.num_steps_sampled_before_learning_starts = 0
+        self.store_buffer_in_checkpoints = True
+        # RLlib's, set to what joint sampling wants.
+        self.env_runner_cls = JointEnvRunner
+        self.num_env_runners = 0
+        self.num_envs_per_env_runner = 8
+        self.rollout_fragment_length = "auto"
+        self.min_sample_timesteps_per_iteration = 1000
+        self.evaluation_config = AlgorithmConfig.overrides(explore=False)
+
+    @override(AlgorithmConfig)
+    def training(
+        self,
+        *,
+        actor_lr: Any = NotProvided,
+        critic_lr: Any = NotProvided,
+        tau: float = NotProvided,
+        updates_per_env_step: float = NotProvided,
+        replay_buffer_capacity: int = NotProvided,
+        critic_state: Literal["observations", "world"] = NotProvided,
+        exploration: dict[str, float] = NotProvided,
+        num_random_steps: int = NotProvided,
+        num_steps_sampled_before_learning_starts: int = NotProvided,
+        store_buffer_in_checkpoints: bool = NotProvided,
+        **kwargs: Any,
+    ) -> Self:
+        """Sets the training settings.
+
+        Args:
+            actor_lr: Learning rate of the actors, or an RLlib schedule over env steps `[[0, 1e-3], ...]`.
+                Default 1e-3.
+            critic_lr: Learning rate of the critics, likewise. Default 1e-2.
+            tau: Share of the online network in Polyak averaging, each update. Default 0.01.
+            updates_per_env_step: Updates for every env step sampled (summed over copies and runners), exact over
+                time: any fraction left over is carried on. Default 1.0.
+            replay_buffer_capacity: Rows of the replay ring, one per joint step. Default 500 000.
+            critic_state: What a centralised critic sees as s: "observations", the concatenation of all agents'
+                (default, the code base's), or "world", the environment's own `state()`.
+            exploration: Overrides of `Exploration`: `epsilon` 0.1, `noise` 0.1, `decay` 5e-7 per env step,
+                `final` 0.05.
+            num_random_steps: Env steps at the start with uniformly random actions. Default 0.
+            num_steps_sampled_before_learning_starts: Env steps before the first update; at least one batch is
+                sampled in any case. These steps owe no updates. Default 0.
+            store_buffer_in_checkpoints: Whether checkpoints hold the replay buffer, so that a restored run goes
+                on exactly as it would have. Default True.
+            **kwargs: RLlib's own: `gamma` (0.95), `train_batch_size_per_learner` (256), ...
+
+        Returns:
+            This config.
+        """
+        super().training(**kwargs)
+        given = {k: v for k, v in locals().items() if k not in ("self", "kwargs", "__class__")}
+        for name, value in given.items():
+            if value is not NotProvided:
+                setattr(self, name, value)
+        return self
+
+    @override(AlgorithmConfig)
+    def validate(self) -> None:
+        """Checks every setting and inspects the environment, before anything long starts.
+
+        Raises:
+            ValueError: If something is not legal; says what, and what would be.
+        """
+        for name in ("actor_lr", "critic_lr"):
+            if isinstance(getattr(self, name), int | float):
+                in_range(name, getattr(self, name), 0.0, open_low=True)
+        in_range("tau", self.tau, 0.0, 1.0, open_low=True)
+        in_range("gamma", self.gamma, 0.0, 1.0)
+        in_range("updates_per_env_step", self.updates_per_env_step, 0.0)
+        for name in ("train_batch_size_per_learner", "replay_buffer_capacity", "num_envs_per_env_runner"):
+            in_range(name, getattr(self, name), 1)
+        for name in ("num_random_steps", "num_steps_sampled_before_learning_starts"):
+            in_range(name, getattr(self, name), 0)
+        if self.train_batch_size_per_learner > self.replay_buffer_capacity:
+            raise ValueError(
+                f"train_batch_size_per_learner ({self.train_batch_size_per_learner}) must not be larger than "
+                f"replay_buffer_capacity ({self.replay_buffer_capacity})."
+            )
+        if self.num_steps_sampled_before_learning_starts > self.replay_buffer_capacity:
+            raise ValueError(
+                f"num_steps_sampled_before_learning_starts ({self.num_steps_sampled_before_learning_starts}) must "
+                f"not be larger than replay_buffer_capacity ({self.replay_buffer_capacity})."
+            )
+        one_of("critic_state", self.critic_state, CRITIC_STATES)
+        Exploration.from_dict(self.exploration)
+        settings = self.model_config
+        one_of("model_config['activation']", settings["activation"], ACTIVATIONS)
+        hidden = settings["hidden_sizes"]
+        if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
+            raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
+        if self.num_learners > 0:
+            raise ValueError(
+                f"num_learners must be 0, not {self.num_learners}: a stacked update of all agents runs in the "
+                f"algorithm's process (on its GPU with num_gpus_per_learner=1). Scale out with num_env_runners "
+                f"or with more Tune trials."
+            )
+        if self.grad_clip is not None:
+            raise ValueError("grad_clip must be None: gradients are not clipped here.")
+        if not issubclass(self.env_runner_cls or object, JointEnvRunner):
+            raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {self.env_runner_cls}: replay is joint.")
+        if not self.normalize_actions:
+            raise ValueError("normalize_actions must be True: the actors' actions are in [-1, 1].")
+        self._inspect_environment()
+        super().validate()
+
+    def _inspect_environment(self) -> None:
+        """Makes one copy of the environment to learn its team, and names the policies after the agents."""
+        if self.env is None:
+            raise ValueError('No environment: set one with config.environment("maobs/spread-3a").')
+        env = make_env(self, num_envs=1)
+        try:
+            self.team = Team.of(env, with_state=self.uses_state and self.critic_state == "world")
+        finally:
+            env.close()
+        if not self.is_multi_agent:
+            self.multi_agent(
+                policies={agent: PolicySpec() for agent in self.team.agents},
+                policy_mapping_fn=own_policy,
+            )
+        self.module_ids = tuple(self.policy_mapping_fn(agent, None) for agent in self.team.agents)
+        if len(set(self.module_ids)) < len(self.module_ids) or set(self.module_ids) != set(self.policies):
+            raise ValueError(
+                f"Every agent needs a policy of its own: agents {self.team.agents} are mapped to "
+                f"{self.module_ids}, policies are {sorted(self.policies)}."
+            )
+        if self.policies_to_train is not None:
+            raise ValueError("policies_to_train must be None: all agents of the team are trained.")
+
+    @property
+    def state_size(self) -> int:
+        """S, the width of what a centralised critic sees as the state."""
+        if self.critic_state == "world":
+            return self.team.state_size
+        return len(self.team.agents) * self.team.observation_size
+
+    def critic_sizes(self) -> tuple[int, int]:
+        """Widths of what one agent's critic sees: of the state and of the actions."""
+        raise TypeError(f"{type(self).__name__} defines no critic_sizes: derive a config that does.")
+
+    @property
+    @override(AlgorithmConfig)
+    def _model_config_auto_includes(self) -> dict[str, Any]:
+        settings: dict[str, Any] = {"hidden_sizes": (64, 64, 64), "activation": "relu", "exploration": self.exploration}
+        if hasattr(self, "team"):
+            settings["critic_state_size"], settings["critic_action_size"] = self.critic_sizes()
+        return settings
+
+    @override(AlgorithmConfig)
+    def get_default_rl_module_spec(self) -> RLModuleSpec:
+        """One `AgentModule` per policy."""
+        return RLModuleSpec(module_class=AgentModule)
+
+    @override(AlgorithmConfig)
+    def get_rollout_fragment_length(self, worker_index: int = 0) -> int:
+        """Steps of every copy between two rounds of updates.
+
+        "auto" is 1 where the runner acts with the learner's own weights, as in the paper, and 16 for remote
+        runners, where each round costs a message and a weight sync.
+        """
+        if self.rollout_fragment_length != "auto":
+            return int(self.rollout_fragment_length)
+        return 1 if self.num_env_runners == 0 else 16
+
+
+class JointAlgorithm(Algorithm):
+    """Off-policy training of a fixed team from joint replay.
+
+    Each round samples a fragment of every copy, adds it to replay, and makes the updates that
+    `updates_per_env_step` owes for it. An iteration is as many rounds as
+    `min_sample_timesteps_per_iteration` takes.
+    """
+
+    replay_buffer: JointReplayBuffer
+
+    @classmethod
+    @override(Algorithm)
+    def get_default_config(cls) -> JointConfig:
+        """The settings all algorithms share."""
+        return JointConfig()
+
+    @override(Algorithm)
+    def setup(self, config: AlgorithmConfig) -> None:
+        """Builds the replay buffer and lets local runners act with the learner's own tensors."""
+        super().setup(config)
+        team: Team = self.config.team
+        self._learner: JointLearner = self.learner_group._learner
+        self.replay_buffer = JointReplayBuffer(
+            self.config.replay_buffer_capacity,
+            len(team.agents),
+            team.observation_size,
+            team.action_size,
+            team.state_size,
+            seed=self.config.seed,
+            device=self._learner.device,
+        )
+        for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None and group.local_env_runner is not None:
+                group.local_env_runner.share_actors(self._learner.actors)
+        self._progress = {"env_steps": 0, "updates": 0, "learning_starts": self._steps_before_learning()}
+
+    def _steps_before_learning(self) -> int:
+        return max(self.config.num_steps_sampled_before_learning_starts, self.config.train_batch_size_per_learner)
+
+    @override(Algorithm)
+    def training_step(self) -> None:
+        """One iteration's rounds of sampling and updates."""
+        goal = self._progress["env_steps"] + max(1, self.config.min_sample_timesteps_per_iteration or 0)
+        while self._progress["env_steps"] < goal:
+            with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
+                samples = self._sample()
+            if not samples:
+                break  # all runners are down: RLlib restores them before it calls again
+            with self.metrics.log_time((TIMERS, REPLAY_BUFFER_ADD_DATA_TIMER)):
+                for sample in samples:
+                    self.replay_buffer.add(**vars(sample))
+                    self._progress["env_steps"] += sample.env_steps()
+            if self._update():
+                self._sync_remote_runners()
+        self._log_results()
+
+    def _sample(self) -> list[JointSample]:
+        """One fragment of every runner."""
+        random_actions = self._progress["env_steps"] < self.config.num_random_steps
+        if self.env_runner_group.num_remote_workers() == 0:
+            samples: list[JointSample] = self.env_runner.sample(random_actions=random_actions)
+            return samples
+
+        def sample_or_error(runner: JointEnvRunner) -> list[JointSample] | ValueError:
+            try:
+                return runner.sample(random_actions=random_actions)
+            except ValueError as error:  # the environment's fault: a restarted runner would meet it again
+                return error
+
+        results = self.env_runner_group.foreach_env_runner(
+            sample_or_error, local_env_runner=False, timeout_seconds=self.config.sample_timeout_s
+        )
+        for result in results:
+            if isinstance(result, ValueError):
+                raise result
+        return [sample for result in results for sample in result]
+
+    def _update(self) -> int:
+        """Makes the updates that are owed for the steps sampled so far; returns how many."""
+        steps = self._progress["env_steps"] - self._progress["learning_starts"]
+        owed = math.floor(self.config.updates_per_env_step * steps) - self._progress["updates"] if steps > 0 else 0
+        batch_size = self.config.train_batch_size_per_learner
+        left = owed
+        while left > 0:
+            count = min(left, max(1, _ROWS_PER_DRAW // batch_size))
+            with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
+                columns = self.replay_buffer.sample((count, batch_size))
+                if "state" not in columns:
+                    columns |= {
+                        "state": columns["obs"].flatten(2),
+                        "next_state": columns["next_obs"].flatten(2),
+                    }
+            with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
+                self.learner_group.update(batch=Batch(**columns), _no_metrics_reduce=True)
+            left -= count
+        self._progress["updates"] += max(0, owed)
+        return owed
+
+    def _sync_remote_runners(self) -> None:
+        # A local runner shares the learner's tensors; only remote ones need the weights sent.
+        if self.env_runner_group.num_remote_workers() > 0:
+            with self.metrics.log_time((TIMERS, SYNCH_WORKER_WEIGHTS_TIMER)):
+                self.env_runner_group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
+
+    def _log_results(self) -> None:
+        """Gathers the runners' and the learner's metrics, once per iteration."""
+        results = self.env_runner_group.foreach_env_runner(
+            lambda runner: runner.get_metrics(),
+            local_env_runner=self.env_runner_group.num_remote_workers() == 0,
+        )
+        self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        timesteps = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self._progress["env_steps"]}
+        report = self._learner.report(timesteps=timesteps)
+        if report is not None:
+            self.metrics.aggregate([report], key=LEARNER_RESULTS)
+
+    @override(Algorithm)
+    def get_state(
+        self,
+        components: str | Collection[str] | None = None,
+        *,
+        not_components: str | Collection[str] | None = None,
+        **kwargs: Any,
+    ) -> dict[str, Any]:
+        """RLlib's state, the progress of updates against steps and, if wanted, the replay buffer."""
+        state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
+        state["progress"] = dict(self._progress)
+        stored = self.config.store_buffer_in_checkpoints
+        if stored and self._check_component(COMPONENT_REPLAY_BUFFER, components, not_components):
+            state[COMPONENT_REPLAY_BUFFER] = self.replay_buffer.get_state()
+        return state
+
+    @override(Algorithm)
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
+        super().set_state(state)
+        if "progress" in state:
+            self._progress = dict(state["progress"])
+        if COMPONENT_REPLAY_BUFFER in state:
+            self.replay_buffer.set_state(state[COMPONENT_REPLAY_BUFFER])
+        if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
+            starts = self._progress["env_steps"] + self._steps_before_learning()
+            self._progress |= {"learning_starts": starts, "updates": 0}
+
+    @override(Algorithm)
+    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
+        """RLlib's components and the replay buffer."""
+        components: list[tuple[str, Checkpointable]] = super().get_checkpointable_components()
+        if self.config.store_buffer_in_checkpoints:
+            components.append((COMPONENT_REPLAY_BUFFER, self.replay_buffer))
+        return components

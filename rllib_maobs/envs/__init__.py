@@ -1,0 +1,30 @@
+"""Multi-agent obstacle-avoidance tasks: one simulator, three faces (arrays, PettingZoo, RLlib)."""
+
+from rllib_maobs.envs.options import Range
+from rllib_maobs.envs.pettingzoo_env import MAObsParallelEnv, parallel_env
+from rllib_maobs.envs.registry import SCENARIOS, make_scenario, make_vec, register_scenario
+from rllib_maobs.envs.rllib_env import EpisodeMetricsCallback, MAObsEnv
+from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
+from rllib_maobs.envs.spread import Spread
+from rllib_maobs.envs.vector import VectorEnv
+from rllib_maobs.envs.world import Bodies, Wall, World
+
+__all__ = [
+    "SCENARIOS",
+    "Bodies",
+    "EpisodeMetricsCallback",
+    "MAObsEnv",
+    "MAObsParallelEnv",
+    "Outcome",
+    "Range",
+    "Scenario",
+    "ScenarioOptions",
+    "Spread",
+    "VectorEnv",
+    "Wall",
+    "World",
+    "make_scenario",
+    "make_vec",
+    "parallel_env",
+    "register_scenario",
+]

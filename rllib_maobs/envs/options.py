@@ -1,0 +1,116 @@
+"""Keyword options of scenarios: frozen dataclasses whose type hints are the legal values."""
+
+import dataclasses
+import difflib
+import numbers
+import types
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Legal range of a number, for `Annotated[int, Range(1)]`.
+
+    Args:
+        low: Smallest legal value.
+        high: Largest legal value.
+        exclusive: Whether `low` itself is illegal.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    exclusive: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        return (value > self.low if self.exclusive else value >= self.low) and value <= self.high
+
+    def __str__(self) -> str:
+        lower = f"{'>' if self.exclusive else '>='} {self.low:g}"
+        return lower if self.high == np.inf else f"{lower} and <= {self.high:g}"
+
+
+def closest(name: str, legal: list[str]) -> str:
+    """Return " (did you mean ...?)" for a misspelt name, or an empty string."""
+    match = difflib.get_close_matches(name, legal, n=1, cutoff=0.5)
+    return f" (did you mean {match[0]!r}?)" if match else ""
+
+
+def build_options(cls: type[T], values: dict[str, Any], owner: str) -> T:
+    """Build an options dataclass from keywords, after checking every name and value.
+
+    Args:
+        cls: A frozen dataclass. Legal values come from its hints: `int`, `float`, `bool`, `str`,
+            `Literal[...]`, `X | None`, and numbers in a range as `Annotated[int, Range(1)]`.
+        values: The keywords.
+        owner: Name of the scenario, for the message.
+
+    Returns:
+        The dataclass with Python numbers (NumPy scalars, as Tune samples them, are converted).
+
+    Raises:
+        ValueError: For an unknown name or an illegal value; the message names what is legal.
+    """
+    hints = get_type_hints(cls, include_extras=True)
+    legal = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    for name in values:
+        if name not in legal:
+            raise ValueError(
+                f"{owner} has no option {name!r}{closest(name, legal)}; legal options: {', '.join(legal)}"
+            )
+    return cls(**{name: _check(value, hints[name], name, owner) for name, value in values.items()})
+
+
+def _check(value: Any, hint: Any, name: str, owner: str) -> Any:
+    """Return the value converted to its hint, or raise a ValueError that says what is legal."""
+    for alternative in _alternatives(hint):
+        accepted, converted = _accept(value, alternative)
+        if accepted:
+            return converted
+    legal = " or ".join(_describe(alternative) for alternative in _alternatives(hint))
+    raise ValueError(f"{owner}: {name}={value!r} is illegal; legal: {legal}")
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+
+
+def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
+    """Return whether the value fits one hint, and the value converted."""
+    if get_origin(hint) is Annotated:
+        inner, limits = get_args(hint)
+        accepted, converted = _accept(value, inner)
+        return accepted and converted in limits, converted
+    if get_origin(hint) is Literal:
+        return value in get_args(hint), value
+    if hint is type(None):
+        return value is None, None
+    if hint is bool:
+        return isinstance(value, bool | np.bool_), bool(value) if isinstance(
+            value, bool | np.bool_
+        ) else value
+    if isinstance(value, bool | np.bool_):
+        return False, value
+    if hint is int:
+        return isinstance(value, numbers.Integral), int(value) if isinstance(
+            value, numbers.Integral
+        ) else value
+    if hint is float:
+        finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
+        return finite, float(value) if finite else value
+    return isinstance(value, hint), value
+
+
+def _describe(hint: Any) -> str:
+    if get_origin(hint) is Annotated:
+        inner, limits = get_args(hint)
+        return f"{_describe(inner)} {limits}"
+    if get_origin(hint) is Literal:
+        return ", ".join(repr(value) for value in get_args(hint))
+    return {int: "an integer", float: "a number", bool: "True or False", type(None): "None"}.get(
+        hint, str(hint)
+    )

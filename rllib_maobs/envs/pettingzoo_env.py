@@ -1,0 +1,97 @@
+"""The scenarios as a ParallelEnv of PettingZoo."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from rllib_maobs.envs.registry import make_scenario
+from rllib_maobs.envs.scenario import Scenario
+from rllib_maobs.envs.single import ByAgent, SingleCopy
+
+
+class MAObsParallelEnv(ParallelEnv):
+    """A scenario as a PettingZoo ParallelEnv; made by `parallel_env`.
+
+    All agents act in every step and end together; `agents` is then empty until the next reset. In the last
+    step the info of every agent holds "episode_metrics", a dictionary of floats.
+
+    Args:
+        scenario: The task.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "rllib_maobs",
+        "is_parallelizable": True,
+        "render_modes": [],
+    }
+
+    def __init__(self, scenario: Scenario[Any]) -> None:
+        self.scenario = scenario
+        self.render_mode = None
+        self._copy = SingleCopy(scenario)
+        self.possible_agents = list(scenario.agents)
+        self.agents: list[str] = []
+        low_high = np.full(self._copy.env.state_size(), np.inf, np.float32)
+        self.state_space = gym.spaces.Box(-low_high, low_high, dtype=np.float32)
+
+    def observation_space(self, agent: str) -> gym.Space[Any]:
+        """Return the observation space of an agent."""
+        return self._copy.env.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gym.Space[Any]:
+        """Return the action space of an agent."""
+        return self._copy.env.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ByAgent, ByAgent]:
+        """Begin an episode.
+
+        Args:
+            seed: Starts a new stream of random numbers; None goes on with the present one.
+            options: Not used.
+
+        Returns:
+            Observations (O,) and infos by agent.
+        """
+        self.agents = list(self.possible_agents)
+        return self._copy.reset(seed)
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]:
+        """Step with one action per agent.
+
+        Args:
+            actions: Actions by agent.
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos by agent.
+        """
+        observations, rewards, terminated, truncated, infos = self._copy.step(actions)
+        if terminated or truncated:
+            self.agents = []
+        agents = self.possible_agents
+        return (
+            observations,
+            rewards,
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            infos,
+        )
+
+    def state(self, kind: str | None = None) -> NDArray[np.float32]:
+        """Return the (S,) global state; see `VectorEnv.state`."""
+        return self._copy.state(kind)
+
+
+def parallel_env(scenario: str | type[Scenario[Any]], **options: Any) -> MAObsParallelEnv:
+    """Make a PettingZoo ParallelEnv.
+
+    Args:
+        scenario: A registered id, or a subclass of `Scenario`.
+        **options: Options of the scenario, documented in its class.
+    """
+    return MAObsParallelEnv(make_scenario(scenario, **options))

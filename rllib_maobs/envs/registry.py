@@ -1,0 +1,61 @@
+"""Scenarios by id."""
+
+from typing import Any
+
+from rllib_maobs.envs.options import closest
+from rllib_maobs.envs.scenario import Scenario
+from rllib_maobs.envs.spread import Spread
+from rllib_maobs.envs.vector import VectorEnv
+
+SCENARIOS: dict[str, tuple[type[Scenario[Any]], dict[str, Any]]] = {
+    "spread-3a": (Spread, {"num_agents": 3, "num_obstacles": 2}),
+    "spread-6a": (Spread, {"num_agents": 6, "num_obstacles": 4}),
+    "spread-9a": (Spread, {"num_agents": 9, "num_obstacles": 6}),
+}
+"""Class and preset options of each scenario id."""
+
+
+def register_scenario(scenario_id: str, cls: type[Scenario[Any]], **options: Any) -> None:
+    """Make a scenario known by an id in this process.
+
+    Ray's worker processes do not see it; there, pass the class itself instead of an id.
+
+    Args:
+        scenario_id: The id; it replaces a scenario of the same id.
+        cls: The scenario.
+        **options: Preset options; checked here, and overridden by those given when the scenario is made.
+    """
+    cls(**options)
+    SCENARIOS[scenario_id] = (cls, options)
+
+
+def make_scenario(scenario: str | type[Scenario[Any]], **options: Any) -> Scenario[Any]:
+    """Make a scenario from its id or class.
+
+    Args:
+        scenario: A registered id, or a subclass of `Scenario`.
+        **options: Options of the scenario, documented in its class.
+
+    Raises:
+        ValueError: If the id or an option is unknown, or a value is illegal; names what is legal.
+    """
+    if isinstance(scenario, type) and issubclass(scenario, Scenario):
+        return scenario(**options)
+    if scenario not in SCENARIOS:
+        legal = list(SCENARIOS)
+        raise ValueError(
+            f"unknown scenario {scenario!r}{closest(str(scenario), legal)}; legal ids: {', '.join(legal)}"
+        )
+    cls, preset = SCENARIOS[scenario]
+    return cls(**{**preset, **options})
+
+
+def make_vec(scenario: str | type[Scenario[Any]], num_envs: int = 1, **options: Any) -> VectorEnv:
+    """Make a `VectorEnv`: E copies that step at once.
+
+    Args:
+        scenario: A registered id, or a subclass of `Scenario`.
+        num_envs: E.
+        **options: Options of the scenario, documented in its class.
+    """
+    return VectorEnv(make_scenario(scenario, **options), num_envs)

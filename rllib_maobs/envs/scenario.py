@@ -1,0 +1,204 @@
+"""What a task declares: bodies, start positions, observations, rewards and metrics."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from rllib_maobs.envs.options import Range, build_options
+from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World
+
+# Direction of each discrete action: idle, +x, -x, +y, -y.
+_DIRECTIONS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class ScenarioOptions:
+    """Options that every scenario has.
+
+    Args:
+        horizon: Steps until an episode is truncated.
+        action_mode: "mpe": Box(-1, 1, (5,)), the force is (a1 - a2, a3 - a4) and a0 is idle; "force": Box(-1,
+            1, (2,)); "discrete": Discrete(5), idle, +x, -x, +y, -y.
+        physics: "mpe", or "solid" (stiffer contacts, five substeps).
+        integrator: "semi_implicit" (the original MPE), or "explicit" (as MPE2 has it, to compare).
+        terminate_on_success: Whether an episode terminates as soon as the task is solved.
+        state: What `state()` returns by default: "observations" (all agents' observations in a row) or
+            "world" (positions of all bodies, then velocities of those that move).
+    """
+
+    horizon: Annotated[int, Range(1)] = 100
+    action_mode: Literal["mpe", "force", "discrete"] = "mpe"
+    physics: Literal["mpe", "solid"] = "mpe"
+    integrator: Literal["semi_implicit", "explicit"] = "semi_implicit"
+    terminate_on_success: bool = False
+    state: Literal["observations", "world"] = "observations"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a step brought, in every copy.
+
+    Args:
+        rewards: (E, N).
+        success: (E,) bool, whether the task is solved now.
+        metrics: (E,) values by name; the names and how they are reduced over the episode are those of
+            `Scenario.metrics`.
+    """
+
+    rewards: FloatArray
+    success: NDArray[np.bool_]
+    metrics: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+
+OptionsT = TypeVar("OptionsT", bound=ScenarioOptions)
+
+
+class Scenario(ABC, Generic[OptionsT]):
+    """Base of all tasks: subclass it and `register_scenario` (or pass the class itself to the environments).
+
+    A scenario holds options, never episode state: it describes E copies at once, and all its arrays have E
+    first.
+
+    Example: reach the origin, alone.
+
+    ```python
+    @dataclass(frozen=True)
+    class HomeOptions(ScenarioOptions):
+        num_agents: Annotated[int, Range(1)] = 2
+
+    class Home(Scenario[HomeOptions]):
+        options_class = HomeOptions
+        metrics = {"distance": "mean"}
+
+        def bodies(self):
+            return [Bodies("agent", self.options.num_agents, radius=0.1, movable=True, accel=5.0)]
+
+        def place(self, rngs):
+            return np.stack([rng.uniform(-1, 1, (self.options.num_agents, 2)) for rng in rngs])
+
+        @property
+        def observation_size(self):
+            return 4
+
+        def observe(self, world, out):
+            out[..., 0:2] = world.velocity
+            out[..., 2:4] = world.position
+
+        def outcome(self, world):
+            distance = np.linalg.norm(world.position, axis=-1)  # (E, N)
+            return Outcome(-distance, (distance < 0.1).all(-1), {"distance": distance.mean(-1)})
+
+    register_scenario("home", Home)
+    env = make_vec("home", num_envs=8, num_agents=4)
+    ```
+
+    Attributes:
+        options_class: The frozen dataclass of the options.
+        metrics: How each metric of `outcome` becomes one number per episode: "last" (value at the end),
+            "mean", "sum", "min" or "max" over the steps, "first" (first step at which it is true, the horizon
+            if it never is).
+        options: The options of this instance.
+        agents: Ids of the N agents.
+
+    Args:
+        **options: Fields of `options_class`; an unknown name or illegal value is a ValueError that names what
+            is legal.
+    """
+
+    options_class: ClassVar[type[ScenarioOptions]] = ScenarioOptions
+    metrics: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(self, **options: Any) -> None:
+        owner = type(self).__name__
+        self.options: OptionsT = build_options(self.options_class, options, owner)  # type: ignore[assignment]
+        self.agents = [f"agent_{i}" for i in range(self.bodies()[0].count)]
+
+    def __repr__(self) -> str:
+        options = ", ".join(f"{name}={value!r}" for name, value in asdict(self.options).items())
+        return f"{type(self).__name__}({options})"
+
+    @abstractmethod
+    def bodies(self) -> Sequence[Bodies]:
+        """Return the groups of bodies, in the order agents, scripted bodies, obstacles, targets."""
+
+    @abstractmethod
+    def place(self, rngs: Sequence[Generator]) -> FloatArray:
+        """Return start positions; velocities start at zero.
+
+        Args:
+            rngs: One generator per copy to place; the layout of a copy is drawn from its own alone.
+
+        Returns:
+            (len(rngs), K, 2).
+        """
+
+    @property
+    @abstractmethod
+    def observation_size(self) -> int:
+        """O, the length of one agent's observation."""
+
+    @abstractmethod
+    def observe(self, world: World, out: NDArray[np.float32]) -> None:
+        """Write the observations of all agents.
+
+        Args:
+            world: The copies.
+            out: (E, N, O), to be filled.
+        """
+
+    @abstractmethod
+    def outcome(self, world: World) -> Outcome:
+        """Return rewards, success and metrics of the situation after a step."""
+
+    def walls(self) -> Sequence[Wall]:
+        """Return the walls of the arena; none by default."""
+        return ()
+
+    def world_state_size(self) -> int:
+        """S of the world state."""
+        return 2 * sum(group.count * (1 + group.movable) for group in self.bodies())
+
+    def world_state(self, world: World) -> NDArray[np.float32]:
+        """Return the (E, S) world state: positions of all bodies, then velocities of those that move."""
+        parts = world.position, world.velocity[:, : world.num_movers]
+        return np.concatenate([part.reshape(world.num_envs, -1) for part in parts], axis=1, dtype=np.float32)
+
+    def make_world(self, num_envs: int) -> World:
+        """Return the physics of E copies."""
+        return World(num_envs, self.bodies(), self.walls(), self.options.physics, self.options.integrator)
+
+    def action_space(self) -> gym.Space[Any]:
+        """Return the action space of one agent; its size depends on `action_mode`."""
+        if self.options.action_mode == "discrete":
+            return gym.spaces.Discrete(5)
+        return gym.spaces.Box(-1.0, 1.0, (5 if self.options.action_mode == "mpe" else 2,), np.float32)
+
+    def control(self, actions: NDArray[Any]) -> FloatArray:
+        """Turn legal actions into directed force in units of a body's `accel`.
+
+        Args:
+            actions: (E, N, A), or (E, N) integers for discrete actions. Continuous ones are clipped to [-1,
+                1].
+
+        Returns:
+            (E, N, 2).
+        """
+        if self.options.action_mode == "discrete":
+            return _DIRECTIONS[actions]
+        clipped = np.clip(actions, -1.0, 1.0, dtype=np.float64)
+        return clipped if self.options.action_mode == "force" else clipped[..., 1::2] - clipped[..., 2::2]
+
+    def scripted_control(self, world: World, rngs: Sequence[Generator]) -> FloatArray:
+        """Return (E, M - N, 2), the control of the movable bodies that are not agents.
+
+        Args:
+            world: The copies.
+            rngs: One generator per copy.
+        """
+        return np.zeros((world.num_envs, world.num_movers - len(self.agents), 2))

@@ -1,0 +1,233 @@
+"""E copies of a scenario, stepped together."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from rllib_maobs.envs.metrics import EpisodeTracker
+from rllib_maobs.envs.scenario import Scenario
+
+Info = dict[str, Any]
+
+
+class VectorEnv:
+    """E copies of a scenario that step at once, arrays in and arrays out.
+
+    Copy e of an environment reset with seed s plays the same episodes as a single copy reset with seed s + e.
+    Nothing is reset automatically: the observation of the last step is the true final one, and
+    `reset(mask=terminated | truncated)` begins the next episode of the copies that have finished.
+
+    The environment can be pickled at any time; the copy continues identically.
+
+    Example:
+    ```python
+    env = make_vec("spread-9a", num_envs=64)
+    obs, _ = env.reset(seed=0)
+    for _ in range(1000):
+        actions = np.random.default_rng().uniform(-1, 1, (64, 9, 5))
+        obs, rewards, terminated, truncated, info = env.step(actions)
+        if (finished := terminated | truncated).any():
+            print(info["episode_metrics"]["coverage"][finished].mean())
+            obs, _ = env.reset(mask=finished)
+    ```
+
+    Attributes:
+        scenario: The task.
+        num_envs: E.
+        agents: Ids of the N agents, in the order of all arrays.
+        horizon: Steps until an episode is truncated.
+        observation_spaces: Space of each agent, by id.
+        action_spaces: Space of each agent, by id.
+        world: The physics; `world.position` and `world.velocity` (E, K, 2) may be written at any time.
+        seeds: (E,) seed that each copy's generator started from.
+
+    Args:
+        scenario: The task.
+        num_envs: E.
+    """
+
+    def __init__(self, scenario: Scenario[Any], num_envs: int = 1) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} is illegal; legal: an integer >= 1")
+        self.scenario = scenario
+        self.num_envs = num_envs
+        self.agents = list(scenario.agents)
+        self.horizon: int = scenario.options.horizon
+        n, o = len(self.agents), scenario.observation_size
+        spaces = {agent: gym.spaces.Box(-np.inf, np.inf, (o,), np.float32) for agent in self.agents}
+        self.observation_spaces: dict[str, gym.Space[Any]] = dict(spaces)
+        self.action_spaces = {agent: scenario.action_space() for agent in self.agents}
+        action_shape: tuple[int, ...] = scenario.action_space().shape or ()
+        self._actions_shape = (num_envs, n, *action_shape)
+        self._discrete = scenario.options.action_mode == "discrete"
+
+        self.world = scenario.make_world(num_envs)
+        accel = [g.accel for g in self.world.groups if g.movable for _ in range(g.count)]
+        self._accel = np.array(accel)[:, None]
+        self.seeds: NDArray[np.int64] = np.full(num_envs, -1, np.int64)
+        self._rngs: list[Generator] | None = None
+        self._tracker = EpisodeTracker(scenario, self.world)
+        self._steps = np.zeros(num_envs, np.int64)
+        # A copy that was never reset is treated like one that has finished: it must be reset.
+        self._finished = np.ones(num_envs, bool)
+
+    def reset(
+        self, seed: int | Sequence[int] | None = None, mask: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], Info]:
+        """Begin a new episode in all copies, or in some.
+
+        Args:
+            seed: An int s gives copy e the seed s + e; a sequence holds E seeds; None goes on with each
+                copy's stream of random numbers (the first reset then takes a seed from the operating system).
+            mask: (E,) bool, the copies to reset; None for all. The others go on with their episodes.
+
+        Returns:
+            (E, N, O) observations of all copies, and an empty info.
+        """
+        copies = np.flatnonzero(self._check_mask(mask))
+        self._seed(seed, copies)
+        assert self._rngs is not None
+        if copies.size:
+            self.world.position[copies] = self.scenario.place([self._rngs[e] for e in copies.tolist()])
+            self.world.velocity[copies] = 0.0
+            self._tracker.reset(copies)
+            self._steps[copies] = 0
+            self._finished[copies] = False
+        return self.observe(), {}
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], Info]:
+        """Step all copies.
+
+        Args:
+            actions: (E, N, A), clipped to [-1, 1]; (E, N) integers for discrete actions.
+
+        Returns:
+            (E, N, O) observations, (E, N) rewards, (E,) terminated, (E,) truncated, info. Where any copy has
+            finished, info["episode_metrics"] holds an (E,) array per metric, NaN for the copies that have not
+            finished.
+
+        Raises:
+            RuntimeError: If a copy has finished, or was never reset.
+            ValueError: If actions have a wrong shape, are not finite or are out of range; names agent and
+                copy.
+        """
+        actions = np.asarray(actions)
+        self._check_step(actions)
+        world, scenario = self.world, self.scenario
+        control = scenario.control(actions)
+        if world.num_movers > len(self.agents):
+            assert self._rngs is not None
+            control = np.concatenate([control, scenario.scripted_control(world, self._rngs)], axis=1)
+        self._tracker.before_step(world)
+        world.step(control * self._accel)
+        self._steps += 1
+
+        outcome = scenario.outcome(world)
+        self._tracker.update(world, outcome)
+        ends = outcome.success if scenario.options.terminate_on_success else np.zeros(self.num_envs, bool)
+        terminated = np.array(ends, bool)
+        truncated = (self._steps >= self.horizon) & ~terminated
+        self._finished = terminated | truncated
+        info: Info = {}
+        if self._finished.any():
+            info["episode_metrics"] = self._tracker.report(self._finished)
+        return self.observe(), outcome.rewards.astype(np.float32), terminated, truncated, info
+
+    def observe(self) -> NDArray[np.float32]:
+        """Return the (E, N, O) observations of the current situation, also after a write to the world."""
+        self.world.refresh()
+        out = np.empty((self.num_envs, len(self.agents), self.scenario.observation_size), np.float32)
+        self.scenario.observe(self.world, out)
+        return out
+
+    def state(self, kind: str | None = None) -> NDArray[np.float32]:
+        """Return the (E, S) global state of the current situation.
+
+        Args:
+            kind: "observations" (all agents' observations in a row) or "world" (positions of all bodies, then
+                velocities of those that move); None for the scenario's option `state`.
+        """
+        if self._state_kind(kind) == "world":
+            return self.scenario.world_state(self.world)
+        return self.observe().reshape(self.num_envs, -1)
+
+    def state_size(self, kind: str | None = None) -> int:
+        """Return S of a kind of state; see `state`."""
+        if self._state_kind(kind) == "world":
+            return self.scenario.world_state_size()
+        return len(self.agents) * self.scenario.observation_size
+
+    def close(self) -> None:
+        """Free nothing: here because every environment has it."""
+
+    def _state_kind(self, kind: str | None) -> str:
+        if kind is None:
+            return str(self.scenario.options.state)
+        if kind not in ("observations", "world"):
+            raise ValueError(f"state kind {kind!r} is illegal; legal: 'observations', 'world'")
+        return kind
+
+    def _check_mask(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(
+                f"mask is {mask.dtype} of shape {mask.shape}; expected bool of shape ({self.num_envs},)"
+            )
+        return mask
+
+    def _seed(self, seed: int | Sequence[int] | None, copies: NDArray[np.intp]) -> None:
+        """Give the copies new generators, or leave them theirs; the first time, all copies get one."""
+        if self._rngs is None:
+            first = int(np.random.SeedSequence().generate_state(1)[0])
+            self.seeds[:] = first + np.arange(self.num_envs)
+            self._rngs = [np.random.default_rng(s) for s in self.seeds]
+        if seed is None:
+            return
+        if isinstance(seed, int | np.integer):
+            seeds = int(seed) + np.arange(self.num_envs)
+        else:
+            seeds = np.asarray(seed, np.int64)
+        if seeds.shape != (self.num_envs,) or (seeds < 0).any():
+            raise ValueError(
+                f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None"
+            )
+        self.seeds[copies] = seeds[copies]
+        for e in copies.tolist():
+            self._rngs[e] = np.random.default_rng(self.seeds[e])
+
+    def _check_step(self, actions: NDArray[Any]) -> None:
+        if self._finished.any():
+            copies = np.flatnonzero(self._finished).tolist()
+            if (self._steps[copies] == 0).all():
+                raise RuntimeError(f"step() before reset(): copies {copies} were never reset")
+            raise RuntimeError(
+                f"step() after the end of the episode of copies {copies}: "
+                f"call reset(mask=terminated | truncated) first"
+            )
+        if actions.shape != self._actions_shape:
+            letters = "(E, N)" if self._discrete else "(E, N, A)"
+            raise ValueError(
+                f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}"
+            )
+        if self._discrete:
+            if not np.issubdtype(actions.dtype, np.integer):
+                raise ValueError(f"discrete actions are {actions.dtype}; expected integers")
+            self._reject(actions, (actions < 0) | (actions >= 5), "not in 0 .. 4")
+        elif not np.isfinite(actions).all():
+            self._reject(actions, ~np.isfinite(actions).all(axis=-1), "not finite")
+
+    def _reject(self, actions: NDArray[Any], bad: NDArray[np.bool_], reason: str) -> None:
+        """Raise for the first bad action, if any; bad is (E, N)."""
+        if bad.any():
+            copy, agent = np.argwhere(bad)[0]
+            raise ValueError(
+                f"action of {self.agents[agent]} in copy {copy} is {reason}: {actions[copy, agent]}"
+            )

@@ -1,0 +1,6 @@
+"""Experiments: training algorithms against each other under Ray Tune, and what their results show."""
+
+from rllib_maobs.experiment.report import load_curves, plot_curves, summarise
+from rllib_maobs.experiment.run import Experiment
+
+__all__ = ["Experiment", "load_curves", "plot_curves", "summarise"]

@@ -1,0 +1,170 @@
+"""The command line of an experiment."""
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+PAPER_HORIZON = 100
+_FILE = "experiment.json"
+_BEFORE_START = (_FILE, "tuner.pkl")  # What is written before the first trial starts.
+# What --quick changes; a flag that is given still wins.
+QUICK = {"seeds": [0], "stop_timesteps": 4000, "no_compile": True, "checkpoint_freq": 2}
+
+
+# What decides the results: a resumed run must have the same.
+SETTINGS = (
+    "algos",
+    "seeds",
+    "stop_timesteps",
+    "train_horizon",
+    "critic_state",
+    "num_env_runners",
+    "checkpoint_freq",
+    "no_compile",
+    "quick",
+)
+
+
+def save_settings(args: argparse.Namespace) -> None:
+    """Write what a resumed run must know into the results folder."""
+    settings = {name: getattr(args, name) for name in SETTINGS}
+    (args.results_dir / _FILE).write_text(json.dumps(settings, indent=2) + "\n")
+
+
+def _at_least(minimum: int) -> Callable[[str], int]:
+    """Return an argparse type: whole numbers from a minimum, also written 2e6 or 2_000_000."""
+
+    def whole_number(text: str) -> int:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or value != int(value) or value < minimum:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {minimum}")
+        return int(value)
+
+    return whole_number
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, but not that a switch is off or that there is none."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if not action.default else super()._get_help_string(action)
+
+
+def make_parser(name: str, algos: Sequence[str], stop_timesteps: int, doc: str | None = None) -> argparse.ArgumentParser:
+    """Build the command line.
+
+    Args:
+        name: Of the experiment.
+        algos: Legal algorithms.
+        stop_timesteps: Default env steps of a trial.
+        doc: Description.
+
+    Returns:
+        The parser.
+    """
+    quick = f"{QUICK['stop_timesteps']} env steps, seed 0, no compiling; flags that are given still count"
+    positive, natural = _at_least(1), _at_least(0)
+    parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
+    what = parser.add_argument_group("what to train")
+    what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
+    what.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2], help="one trial per algorithm and seed")
+    what.add_argument("--stop-timesteps", type=positive, default=stop_timesteps, help="env steps of every trial")
+    what.add_argument(
+        "--train-horizon",
+        type=positive,
+        default=PAPER_HORIZON,
+        help=f"steps of a training episode; evaluation episodes always have {PAPER_HORIZON}",
+    )
+    what.add_argument(
+        "--critic-state",
+        choices=["observations", "world"],
+        default="observations",
+        help="the state that centralised critics see: all observations side by side, or the positions and velocities",
+    )
+    what.add_argument("--quick", action="store_true", help=f"the same job in a few minutes: {quick}")
+
+    how = parser.add_argument_group("how to run it")
+    how.add_argument("--workers", type=positive, default=2, help="trials at once on this machine, one core each")
+    how.add_argument(
+        "--num-env-runners",
+        type=natural,
+        default=0,
+        help="EnvRunner actors per trial, one core each; with 0 the trial's own process samples",
+    )
+    how.add_argument("--address", help="Ray cluster to run on (auto: the one on this machine) instead of starting one")
+    how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
+    how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard on http://127.0.0.1:8265")
+
+    where = parser.add_argument_group("where results go")
+    where.add_argument(
+        "--results-dir",
+        type=Path,
+        help=f"folder for everything that is written (default: results/{name}, with --quick results/{name}-quick)",
+    )
+    where.add_argument(
+        "--checkpoint-freq", type=positive, default=50, help="iterations (of 1000 env steps) between checkpoints"
+    )
+    where.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with the run in --results-dir from its last checkpoints, with its settings; finished trials stay",
+    )
+    return parser
+
+
+def parse(parser: argparse.ArgumentParser, name: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Read the command line; errors end the program with a message and code 2, before anything is started.
+
+    Args:
+        parser: From `make_parser`.
+        name: Of the experiment.
+        argv: Arguments; None for those of the program.
+
+    Returns:
+        The arguments, with an absolute `results_dir`; those of the original run with `--resume`.
+    """
+    args = parser.parse_args(argv)
+    if args.quick:
+        parser.set_defaults(**QUICK)
+        args = parser.parse_args(argv)
+    for flag in ("algos", "seeds"):
+        values = getattr(args, flag)
+        if len(set(values)) < len(values):
+            parser.error(f"--{flag}: {' '.join(map(str, values))} names one of them twice")
+    if args.address and args.workers != parser.get_default("workers"):
+        parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
+
+    results_dir = (args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)).resolve()
+    started = results_dir.is_dir() and any(path.name not in _BEFORE_START for path in results_dir.iterdir())
+    if args.resume:
+        if not started or not (results_dir / _FILE).is_file():
+            parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
+        args = _with_stored_settings(parser, argv, results_dir / _FILE)
+    elif started:
+        parser.error(
+            f"{results_dir} is not empty: continue the run there with --resume, or choose another --results-dir"
+        )
+    args.results_dir = results_dir
+    return args
+
+
+def _with_stored_settings(
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None, path: Path
+) -> argparse.Namespace:
+    """Parse again with the settings of the original run as defaults, and refuse flags that contradict them."""
+    stored = json.loads(path.read_text())
+    parser.set_defaults(**stored)
+    args = parser.parse_args(argv)
+    for name, value in stored.items():
+        if getattr(args, name) != value:
+            flag = f"--{name.replace('_', '-')}"
+            parser.error(
+                f"{flag}: the run in {path.parent} has {value}, and --resume continues it as it is: leave {flag} out, "
+                f"or start a new run in another --results-dir"
+            )
+    return args

@@ -1,0 +1,113 @@
+"""How an experiment tells how far it is: one small table every half minute."""
+
+import heapq
+import time
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Any
+
+from ray.tune import ProgressReporter
+
+from rllib_maobs.experiment.report import LABELS, SCORE, evaluation_metrics, format_table
+
+STEPS = "num_env_steps_sampled_lifetime"
+_STATUS = {"RUNNING": "running", "TERMINATED": "done", "ERROR": "failed"}
+
+
+def makespan(seconds: Iterable[float], workers: int) -> float:
+    """Say how long some jobs take when each starts as soon as a worker is free, in the given order."""
+    free_at = [0.0] * max(workers, 1)
+    for duration in seconds:
+        heapq.heapreplace(free_at, free_at[0] + duration)
+    return max(free_at)
+
+
+def format_time(seconds: float | None) -> str:
+    """Write a duration as hours, minutes and seconds; "-" if it is not known."""
+    if seconds is None:
+        return "-"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+class ProgressTable(ProgressReporter):
+    """Prints a line per trial: status, env steps, score, coverage, collisions, speed, time left.
+
+    Args:
+        stop_timesteps: Env steps of a trial.
+        every_s: Seconds between tables.
+    """
+
+    def __init__(self, stop_timesteps: int, every_s: float) -> None:
+        self._stop_timesteps = stop_timesteps
+        self._every_s = every_s
+        self._started = self._reported = time.monotonic()
+        # Trial id -> env steps and seconds of its first result since it started: where its speed is counted from, for
+        # compiling and filling the replay buffer come before.
+        self._from: dict[str, tuple[int, float]] = {}
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """Start the clock; Tune calls this once before the trials start."""
+        self._started = self._reported = time.monotonic()
+        self._from = {}
+
+    def should_report(self, trials: list[Any], done: bool = False) -> bool:
+        """Return whether it is time for a table."""
+        for trial in trials:
+            if trial.status == "RUNNING" and trial.last_result.get(STEPS):
+                self._from.setdefault(trial.trial_id, (trial.last_result[STEPS], trial.last_result["time_total_s"]))
+        return done or time.monotonic() - self._reported >= self._every_s
+
+    def report(self, trials: list[Any], done: bool, *sys_info: str) -> None:
+        """Print the table."""
+        self._reported = time.monotonic()
+        print(f"\n{self.table(trials)}", flush=True)
+
+    def table(self, trials: list[Any]) -> str:
+        """Return the table.
+
+        Args:
+            trials: Tune's trials.
+
+        Returns:
+            A line with the time elapsed and left, and one line per trial.
+        """
+        metrics = [evaluation_metrics(trial.last_result) for trial in trials]
+        headline = "coverage" if any("coverage" in row for row in metrics) else "success"
+        shown = [SCORE, headline, "collisions"]
+        speeds = [self._speed(trial) for trial in trials]
+        known = [speed for speed in speeds if speed]
+        rows, remaining = [], []
+        for trial, values, speed in zip(trials, metrics, speeds, strict=True):
+            status = _STATUS.get(trial.status, "waiting")
+            steps = trial.last_result.get(STEPS, 0)
+            left = None
+            if status in ("running", "waiting") and known:
+                left = max(self._stop_timesteps - steps, 0) / (speed or sum(known) / len(known))
+                remaining.append(left)
+            rows.append(
+                [
+                    str(trial),
+                    status,
+                    f"{steps:,} / {self._stop_timesteps:,}",
+                    *(f"{values[name]:.2f}" if name in values else "-" for name in shown),
+                    f"{speed:.0f}" if speed else "-",
+                    format_time(left if status == "running" else None),
+                ]
+            )
+        now, elapsed = datetime.now(), time.monotonic() - self._started
+        head = f"{now:%H:%M:%S}  {format_time(elapsed)} since the start"
+        running = sum(trial.status == "RUNNING" for trial in trials)
+        if remaining and running:
+            head += f", about {format_time(makespan(remaining, running))} left"
+        header = ["trial", "status", "env steps", *(LABELS[name] for name in shown), "env steps/s", "left"]
+        return f"{head}\n{format_table(header, rows)}"
+
+    def _speed(self, trial: Any) -> float | None:
+        """Return env steps per second since the trial's first result, once there is a second one."""
+        result = trial.last_result
+        if trial.trial_id not in self._from:
+            return None
+        steps, seconds = self._from[trial.trial_id]
+        seconds = result["time_total_s"] - seconds
+        return (result[STEPS] - steps) / seconds if seconds > 0 else None

@@ -1,0 +1,238 @@
+"""What a finished (or running) experiment shows: learning curves, a picture of them, a comparison table.
+
+Everything here reads the files that Ray Tune writes, so a notebook can use it on any results folder:
+
+    curves = load_curves("results/spread-9a")
+    print(summarise(curves))
+    plot_curves(curves, "curves.png")
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+FILES = ("comparison.md", "comparison.csv", "curves.csv", "curves.png")
+SCORE = "score"
+# How the table calls what is measured, in its order; a task reports those that make sense for it.
+LABELS = {
+    SCORE: "score",
+    "coverage": "coverage",
+    "success": "success",
+    "all_covered": "all covered",
+    "captures": "captures",
+    "collisions": "collisions / episode",
+    "collision_free": "collision-free",
+}
+_KEYS = ["trial", "algorithm", "seed", "env_steps"]
+
+
+def evaluation_metrics(result: Mapping[str, Any]) -> dict[str, float]:
+    """Take the means over the evaluation episodes out of one RLlib result.
+
+    Args:
+        result: What `Algorithm.train()` returned.
+
+    Returns:
+        The metrics of the environment by name, `score` (undiscounted return of the first agent) and `collisions`
+        (with agents, obstacles and walls together). Empty if no episode has been evaluated yet.
+    """
+    runners = result.get("evaluation", {}).get("env_runners", {})
+    metrics = {name: float(value) for name, value in runners.get("episode_metrics", {}).items()}
+    collisions = [value for name, value in metrics.items() if name.startswith("collisions_")]
+    if collisions:
+        metrics["collisions"] = sum(collisions)
+    if returns := runners.get("agent_episode_returns_mean"):
+        metrics[SCORE] = float(returns[min(returns)])
+    return metrics
+
+
+def load_curves(results_dir: str | Path) -> pd.DataFrame:
+    """Read the learning curves of all trials of an experiment.
+
+    Args:
+        results_dir: The folder that the experiment wrote to.
+
+    Returns:
+        One row per trial and evaluation, ordered by trial and env steps: `trial`, `algorithm`, `seed`, `env_steps`,
+        `score`, every metric of the environment, `time_total_s` and `env_steps_per_s` (evaluation included). Rows
+        that a resumed trial computed again replace the first ones.
+
+    Raises:
+        FileNotFoundError: If no trial has reported anything there.
+    """
+    frames = [pd.DataFrame(list(_rows(path))) for path in sorted(Path(results_dir).glob("*/result.json"))]
+    frames = [frame for frame in frames if len(frame)]
+    if not frames:
+        raise FileNotFoundError(f"No trial has reported a result in {results_dir}")
+    curves = pd.concat(frames, ignore_index=True)
+    first = [*_KEYS, *(name for name in LABELS if name in curves)]
+    return curves[[*first, *(name for name in curves if name not in first)]]
+
+
+def _rows(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of one trial's result.json: one JSON object per line."""
+    rows: list[dict[str, Any]] = []
+    for line in path.read_text().splitlines():
+        try:
+            result = json.loads(line)
+        except json.JSONDecodeError:
+            continue  # The last line of a run that was killed while writing it.
+        steps = int(result["num_env_steps_sampled_lifetime"])
+        # A resumed trial goes back to its last checkpoint; what it had reported after that is void.
+        while rows and rows[-1]["env_steps"] >= steps:
+            rows.pop()
+        steps_before = rows[-1]["env_steps"] if rows else 0
+        rows.append(
+            {
+                "trial": path.parent.name,
+                "algorithm": result["config"]["algorithm"],
+                "seed": int(result["config"]["seed"]),
+                "env_steps": steps,
+                **evaluation_metrics(result),
+                "time_total_s": float(result["time_total_s"]),
+                "env_steps_per_s": (steps - steps_before) / max(float(result["time_this_iter_s"]), 1e-9),
+            }
+        )
+    yield from rows
+
+
+def summarise(curves: pd.DataFrame, last: int = 10) -> pd.DataFrame:
+    """Compare the algorithms by their last evaluations.
+
+    Args:
+        curves: From `load_curves`.
+        last: How many evaluations at the end of each trial count; their mean is the trial's result.
+
+    Returns:
+        One row per algorithm, best score first: `seeds` (number of trials), `env_steps` (of the shortest trial), for
+        every measure its mean over the seeds, `score_std` (sample standard deviation over the seeds, NaN for a
+        single one), `env_steps_per_s` and `hours` (per trial, means over the seeds).
+    """
+    measures = [name for name in LABELS if name in curves]
+    by_trial = curves.groupby(["algorithm", "trial"], sort=False)
+    trials = by_trial[measures].agg(lambda column: column.tail(last).mean())
+    end = by_trial[["env_steps", "time_total_s"]].last()
+    trials["env_steps"] = end["env_steps"]
+    trials["env_steps_per_s"] = end["env_steps"] / end["time_total_s"]
+    trials["hours"] = end["time_total_s"] / 3600
+
+    by_algorithm = trials.groupby("algorithm", sort=False)
+    table = by_algorithm[[*measures, "env_steps_per_s", "hours"]].mean()
+    table.insert(0, "seeds", by_algorithm.size())
+    table.insert(1, "env_steps", by_algorithm["env_steps"].min())
+    if SCORE in table:
+        table.insert(table.columns.get_loc(SCORE) + 1, "score_std", by_algorithm[SCORE].std())
+        table = table.sort_values(SCORE, ascending=False)
+    return table
+
+
+def to_markdown(table: pd.DataFrame) -> str:
+    """Write the table of `summarise` as markdown.
+
+    Args:
+        table: From `summarise`.
+
+    Returns:
+        A markdown table, aligned to be read as plain text too.
+    """
+    header = ["algorithm", "seeds", "env steps"]
+    header += [LABELS[name] for name in LABELS if name in table] + ["env steps/s", "hours"]
+    rows = []
+    for algorithm, row in table.iterrows():
+        cells = [str(algorithm), f"{row['seeds']:.0f}", f"{row['env_steps']:,.0f}"]
+        for name in LABELS:
+            if name == SCORE and name in table:
+                spread = "" if np.isnan(row["score_std"]) else f" ± {row['score_std']:.1f}"
+                cells.append(f"{row[name]:.1f}{spread}")
+            elif name in table:
+                cells.append(f"{row[name]:.2f}")
+        rows.append([*cells, f"{row['env_steps_per_s']:.0f}", f"{row['hours']:.2f}"])
+    return format_table(header, rows, markdown=True)
+
+
+def format_table(header: list[str], rows: list[list[str]], *, markdown: bool = False) -> str:
+    """Align cells: the first column to the left, the numbers to the right.
+
+    Args:
+        header: Names of the columns.
+        rows: Their cells.
+        markdown: Whether to draw the lines of a markdown table.
+
+    Returns:
+        The table, without a newline at the end.
+    """
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+
+    def line(cells: list[str]) -> str:
+        padded = [cells[0].ljust(widths[0])]
+        padded += [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
+        return f"| {' | '.join(padded)} |" if markdown else "  ".join(padded).rstrip()
+
+    lines = [line(header), *map(line, rows)]
+    if markdown:
+        lines.insert(1, line(["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]))
+    return "\n".join(lines)
+
+
+def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points: int = 200) -> None:
+    """Draw score and coverage (or success, for tasks without targets to share) against env steps.
+
+    Each algorithm is a line, the mean over its seeds, in a band from its worst to its best seed.
+
+    Args:
+        curves: From `load_curves`.
+        path: The picture's file; its ending chooses the format.
+        title: Written above.
+        points: Evaluations are averaged to at most so many points per line.
+    """
+    # The figure is drawn without pyplot: no window, no global state, whatever backend a notebook has chosen.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [name for name in (SCORE, "coverage" if "coverage" in curves else "success") if name in curves]
+    width = max(int(curves["env_steps"].max()) / points, 1.0)
+    binned = curves.assign(bin=np.ceil(curves["env_steps"] / width))
+    by_trial = binned.groupby(["algorithm", "trial", "bin"], sort=False)[["env_steps", *shown]].mean()
+
+    figure = Figure(figsize=(6.0 * len(shown), 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, name in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        for algorithm, trials in by_trial.groupby("algorithm", sort=False):
+            bins = trials.groupby("bin")
+            steps, seeds = bins["env_steps"].mean(), bins[name]
+            (line,) = axes.plot(steps, seeds.mean(), label=algorithm, marker="o" if len(steps) < 10 else "")
+            axes.fill_between(steps, seeds.min(), seeds.max(), color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.set_xlabel("env steps")
+        axes.set_ylabel("score (return of the first agent)" if name == SCORE else LABELS[name])
+        axes.grid(alpha=0.3)
+        axes.legend()
+    if title:
+        figure.suptitle(title)
+    figure.savefig(path, dpi=150)
+
+
+def write_report(results_dir: Path, title: str) -> str:
+    """Write the `FILES` into the results folder.
+
+    Args:
+        results_dir: The folder that the experiment wrote to.
+        title: Heading of the picture and of the table.
+
+    Returns:
+        The comparison table as markdown.
+
+    Raises:
+        FileNotFoundError: If no trial has reported anything there.
+    """
+    curves = load_curves(results_dir)
+    table = summarise(curves)
+    markdown = to_markdown(table)
+    curves.to_csv(results_dir / "curves.csv", index=False)
+    plot_curves(curves, results_dir / "curves.png", title)
+    table.to_csv(results_dir / "comparison.csv")
+    (results_dir / "comparison.md").write_text(f"# {title}\n\n{markdown}\n")
+    return markdown

@@ -1,0 +1,161 @@
+"""One trial of an experiment: an algorithm, a seed and plain settings, run under Ray Tune."""
+
+import contextlib
+import os
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from ray import tune
+from ray.rllib.algorithms import AlgorithmConfig
+
+import rllib_maobs as maobs
+
+# What Tune fills in by itself for the trial; the algorithm inside fills in its own, with a config of a thousand lines.
+_FILLED_BY_TUNE = {
+    "config",
+    "trial_id",
+    "done",
+    "date",
+    "timestamp",
+    "pid",
+    "hostname",
+    "node_ip",
+    "training_iteration",
+    "iterations_since_restore",
+    "time_since_restore",
+    "time_this_iter_s",
+    "time_total_s",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialSpec:
+    """The settings of one trial, as plain values: Tune writes them to the trial's `params.json`.
+
+    Attributes:
+        algorithm: Name of the algorithm.
+        seed: Of the environments, the exploration noise and the initial weights.
+        env: Registered name of the environment.
+        training: Arguments of the config's `training()`.
+        env_config: Options of the training environments.
+        evaluation_env_config: Options of the evaluation environments where they differ.
+        num_env_runners: Actors that sample beside the trial's own process; with 0 it samples itself.
+        torch_compile: Whether the update runs under `torch.compile`.
+        steps_per_iteration: Env steps between evaluations.
+        evaluation_duration: Episodes per evaluation.
+    """
+
+    algorithm: str
+    seed: int
+    env: str
+    training: dict[str, Any]
+    env_config: dict[str, Any] = field(default_factory=dict)
+    evaluation_env_config: dict[str, Any] = field(default_factory=dict)
+    num_env_runners: int = 0
+    torch_compile: bool = True
+    steps_per_iteration: int = 1000
+    evaluation_duration: int = 10
+
+    def build_config(self) -> AlgorithmConfig:
+        """Return the algorithm's config.
+
+        Returns:
+            The config; one iteration is `steps_per_iteration` env steps and an evaluation without exploration noise
+            on environments of its own.
+        """
+        return (
+            maobs.ALGORITHMS[self.algorithm]()
+            .environment(self.env, env_config=self.env_config)
+            .env_runners(num_env_runners=self.num_env_runners, num_envs_per_env_runner=8)
+            .training(**self.training)
+            .framework(torch_compile_learner=self.torch_compile)
+            .evaluation(
+                evaluation_interval=1,
+                evaluation_duration=self.evaluation_duration,
+                evaluation_config=AlgorithmConfig.overrides(
+                    env_config=self.evaluation_env_config,
+                    explore=False,
+                    num_envs_per_env_runner=self.evaluation_duration,
+                ),
+            )
+            .reporting(min_sample_timesteps_per_iteration=self.steps_per_iteration)
+            .debugging(seed=self.seed)
+        )
+
+
+class Trial(tune.Trainable):
+    """An RLlib algorithm built from a `TrialSpec`.
+
+    Tune runs one class of trainables per experiment, RLlib has one per algorithm: this one holds any of them, so
+    that all algorithms share the workers, the progress table and the results folder. Its checkpoints are the
+    algorithm's own: `Algorithm.from_checkpoint` reads them.
+    """
+
+    @classmethod
+    def default_resource_request(cls, config: dict[str, Any]) -> Any:
+        """Ask for what RLlib would ask for: one CPU, and one per EnvRunner actor."""
+        algorithm = TrialSpec(**config).build_config()
+        return algorithm.algo_class.default_resource_request(algorithm)
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Build the algorithm."""
+        self._algorithm = _build(TrialSpec(**config).build_config())
+
+    def step(self) -> dict[str, Any]:
+        """Train for one iteration."""
+        return {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
+
+    def save_checkpoint(self, checkpoint_dir: str) -> None:
+        """Save the algorithm."""
+        self._algorithm.save_checkpoint(checkpoint_dir)
+
+    def load_checkpoint(self, checkpoint: Any) -> None:
+        """Restore the algorithm."""
+        self._algorithm.load_checkpoint(checkpoint)
+
+    def cleanup(self) -> None:
+        """Stop the algorithm."""
+        self._algorithm.stop()
+
+
+def measure_env_steps_per_s(spec: TrialSpec, seconds: float) -> float:
+    """Train for a moment to see how fast a trial will run on this machine.
+
+    Args:
+        spec: The trial. Compiling it fills the on-disk cache from which the trial itself will be compiled.
+        seconds: How long to measure, once learning has started and everything is compiled.
+
+    Returns:
+        Env steps per second, evaluation included.
+    """
+    # Short iterations without evaluation, which is timed alone: a few seconds are enough for both.
+    config = spec.build_config().evaluation(evaluation_interval=10**9)
+    algorithm = _build(config.reporting(min_sample_timesteps_per_iteration=100))
+    while not any(key != "__all_modules__" for key in algorithm.train().get("learners", {})):
+        pass
+    result = algorithm.train()
+    steps, start = result["num_env_steps_sampled_lifetime"], time.perf_counter()
+    elapsed = 0.0
+    while elapsed < seconds:
+        result = algorithm.train()
+        elapsed = time.perf_counter() - start
+    per_step = elapsed / (result["num_env_steps_sampled_lifetime"] - steps)
+    algorithm.evaluate()
+    start = time.perf_counter()
+    algorithm.evaluate()
+    per_step += (time.perf_counter() - start) / spec.steps_per_iteration
+    algorithm.stop()
+    return float(1.0 / per_step)
+
+
+def _build(config: AlgorithmConfig) -> Any:
+    """Build the algorithm for a process with one core to itself."""
+    torch.set_num_threads(1)
+    maobs.register()
+    algorithm = config.build_algo()
+    # RLlib makes a log folder in the home directory for an algorithm that Tune does not know; nothing goes there.
+    with contextlib.suppress(OSError):
+        os.rmdir(algorithm.logdir)
+    return algorithm

@@ -1,0 +1,457 @@
+"""JointEnvRunner: steps E environment copies at once and returns joint columns instead of episode objects."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import time
+import uuid
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core import COMPONENT_RL_MODULE
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
+from ray.rllib.env import INPUT_ENV_SPACES
+from ray.rllib.env.env_context import EnvContext
+from ray.rllib.env.env_runner import EnvRunner
+from ray.rllib.utils.annotations import override
+from ray.rllib.utils.checkpoints import Checkpointable
+from ray.rllib.utils.metrics import (
+    EPISODE_AGENT_RETURN_MEAN,
+    EPISODE_AGENT_STEPS,
+    EPISODE_DURATION_SEC_MEAN,
+    EPISODE_LEN_MAX,
+    EPISODE_LEN_MEAN,
+    EPISODE_LEN_MIN,
+    EPISODE_MODULE_RETURN_MEAN,
+    EPISODE_RETURN_MAX,
+    EPISODE_RETURN_MEAN,
+    EPISODE_RETURN_MIN,
+    NUM_AGENT_STEPS_SAMPLED,
+    NUM_AGENT_STEPS_SAMPLED_LIFETIME,
+    NUM_ENV_STEPS_SAMPLED,
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    NUM_EPISODES,
+    NUM_EPISODES_LIFETIME,
+    NUM_MODULE_STEPS_SAMPLED,
+    NUM_MODULE_STEPS_SAMPLED_LIFETIME,
+    RLMODULE_INFERENCE_TIMER,
+    SAMPLE_TIMER,
+    WEIGHTS_SEQ_NO,
+)
+from ray.tune.registry import ENV_CREATOR, _global_registry
+
+from rllib_maobs.envs.joint import JointEnv, Team, make_joint_env, register_envs, snapshot
+from rllib_maobs.modules.exploration import Exploration
+from rllib_maobs.modules.stack import Stack
+
+EPISODE_METRICS = "episode_metrics"
+COMPONENT_SAMPLING = "sampling"
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """L steps of E copies as joint columns: the arguments of `JointReplayBuffer.add`, which explains them."""
+
+    obs: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    final_obs: NDArray[np.float32]
+    state: NDArray[np.float32] | None
+    final_state: NDArray[np.float32] | None
+    source: str
+    start: int
+
+    def env_steps(self) -> int:
+        """L * E."""
+        return self.terminated.size
+
+    def agent_steps(self) -> int:
+        """L * E * N."""
+        return self.rewards.size
+
+
+def env_creator(config: AlgorithmConfig) -> Any:
+    """The function that makes the environment of a config from its `env_config`.
+
+    Raises:
+        ValueError: If `config.env` is neither a registered name nor an environment class.
+    """
+    register_envs()  # names are lost when Ray restarts
+    if isinstance(config.env, type):
+        return config.env
+    if isinstance(config.env, str) and _global_registry.contains(ENV_CREATOR, config.env):
+        return _global_registry.get(ENV_CREATOR, config.env)
+    raise ValueError(
+        f"Unknown environment {config.env!r}; legal are {', '.join(sorted(register_envs()))}, a name registered "
+        f"with ray.tune.register_env, or an environment class."
+    )
+
+
+def make_env(config: AlgorithmConfig, num_envs: int, worker_index: int = 0) -> JointEnv:
+    """E copies of a config's environment, see `make_joint_env`."""
+    context = EnvContext(config.env_config or {}, worker_index=worker_index, num_workers=config.num_env_runners)
+    return make_joint_env(env_creator(config), context, num_envs)
+
+
+class JointEnvRunner(EnvRunner, Checkpointable):
+    """Samples a fixed team's joint steps from E copies that step together.
+
+    All agents of all copies act in one stacked forward pass, and what comes back are arrays `(L, E, N, ...)`.
+    Set by the algorithms of this package as `env_runner_cls`; `sample()` and `get_metrics()` keep RLlib's
+    signatures and result keys, so RLlib's evaluation, fault tolerance and Tune work with it unchanged.
+    """
+
+    @override(EnvRunner)
+    def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
+        super().__init__(config=config, **kwargs)
+        self.team: Team = self.config.team
+        self.module_ids: tuple[str, ...] = self.config.module_ids
+        self.env: JointEnv | None = None
+        self.num_envs: int = self.config.num_envs_per_env_runner
+        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
+        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
+        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation),))
+        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
+        self._generator = torch.Generator().manual_seed(int(seeds.generate_state(1)[0]))
+        if self.worker_index is None or self.worker_index > 0 or self.num_workers == 0:
+            self.make_env()
+        elif self.config.create_env_on_local_worker:
+            self.make_env()
+        self.module: MultiRLModule | None = None
+        self._weights_seq_no = 0
+        self.make_module()
+
+        # Where the copies are in their episodes.
+        self._obs: NDArray[np.float32] | None = None
+        self._needs_reset = True
+        self._returns = np.zeros((self.num_envs, len(self.team.agents)))
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._started = np.zeros(self.num_envs)
+        self._steps_sampled = 0
+        self._source = f"{self.worker_index}-{uuid.uuid4().hex}"
+        self._counted = {"steps": 0, "episodes": 0}
+        self._done_episodes: list[dict[str, Any]] = []
+
+    @override(EnvRunner)
+    def make_env(self) -> None:
+        """Makes the E copies anew; they are reset at the next `sample()`."""
+        if self.env is not None:
+            self.env.close()
+        self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
+        spaces = self.team.action_space
+        self._low = spaces.low.astype(np.float32)
+        self._range = ((spaces.high - spaces.low) / 2.0).astype(np.float32)
+        self._needs_reset = True
+
+    @override(EnvRunner)
+    def make_module(self) -> None:
+        """Builds the agents' modules and stacks their actors, so that all act in one call."""
+        spec = self.config.get_multi_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
+        self.module = spec.build()
+        self.actors = Stack([self.module[mid].actor for mid in self.module_ids])
+        self.exploration: Exploration = self.module[self.module_ids[0]].exploration
+
+    def share_actors(self, actors: Stack) -> None:
+        """Acts with the tensors of a learner in this process from now on, so weights need no syncing."""
+        self.actors.share(actors)
+
+    @override(EnvRunner)
+    def sample(
+        self,
+        *,
+        num_timesteps: int | None = None,
+        num_episodes: int | None = None,
+        explore: bool | None = None,
+        random_actions: bool = False,
+        force_reset: bool = False,
+        **kwargs: Any,
+    ) -> list[JointSample]:
+        """Steps the copies.
+
+        Args:
+            num_timesteps: Env steps to sample at least, over all copies. None: `rollout_fragment_length` steps
+                of every copy.
+            num_episodes: Episodes to sample instead. They are dealt out to the copies in equal shares, so short
+                episodes are not favoured, and all copies start afresh.
+            explore: Whether to explore; None takes the config's.
+            random_actions: Whether to act uniformly at random.
+            force_reset: Whether all copies start afresh.
+            **kwargs: Ignored.
+
+        Returns:
+            One `JointSample` in a list.
+
+        Raises:
+            ValueError: If an observation or reward is not finite; names the agent, copy and step.
+        """
+        if self.env is None:
+            raise ValueError(f"{self} has no environment, so it cannot sample.")
+        if num_timesteps is not None and num_episodes is not None:
+            raise ValueError("Give either num_timesteps or num_episodes, not both.")
+        explore = self.config.explore if explore is None else explore
+        with self.metrics.log_time(SAMPLE_TIMER):
+            if force_reset or num_episodes is not None or self._needs_reset:
+                self._reset_all()
+            start = self._steps_sampled
+            if num_episodes is not None:
+                steps = self._play(num_episodes, explore, random_actions)
+                self._needs_reset = True
+            else:
+                length = self.config.get_rollout_fragment_length(self.worker_index)
+                if num_timesteps is not None:
+                    length = math.ceil(num_timesteps / self.num_envs)
+                steps = [self._step(explore, random_actions) for _ in range(length)]
+        columns, finals = [list(part) for part in zip(*steps, strict=True)]
+        stacked = [None if c[0] is None else np.stack(c) for c in zip(*columns, strict=True)]
+        final = [None if c[0] is None else np.concatenate(c) for c in zip(*finals, strict=True)]
+        obs, state, actions, rewards, terminated, truncated = stacked
+        assert obs is not None and actions is not None and rewards is not None and final[0] is not None
+        assert terminated is not None and truncated is not None
+        return [
+            JointSample(obs, actions, rewards, terminated, truncated, final[0], state, final[1], self._source, start)
+        ]
+
+    def _reset_all(self) -> None:
+        assert self.env is not None
+        # Copies are seeded once; after that each goes on in its own stream.
+        seeds = self._env_seeds if self._obs is None else None
+        self._obs, _ = self.env.reset(seed=seeds)
+        self._check_finite("observation", self._obs)
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self._started[:] = time.time()
+        self._needs_reset = False
+        self._steps_sampled += 1  # a gap: what follows is not linked to what was sampled before
+
+    def _play(self, num_episodes: int, explore: bool, random_actions: bool) -> list[Any]:
+        """Plays episodes: copy e plays its share of them; further ones of it are not counted."""
+        left = np.full(self.num_envs, num_episodes // self.num_envs)
+        left[: num_episodes % self.num_envs] += 1
+        steps = []
+        while (left > 0).any():
+            steps.append(self._step(explore, random_actions, counted=left > 0))
+            left -= steps[-1][0][4] | steps[-1][0][5]
+        return steps
+
+    def _step(self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None) -> tuple[Any, Any]:
+        """One step of all copies: its row of every column, and the final observations and states."""
+        assert self.env is not None and self._obs is not None
+        obs, state = self._obs, self._state()
+        actions = self._act(obs, explore, random_actions)
+        self._obs, rewards, terminated, truncated, info = self.env.step(self._low + (actions + 1.0) * self._range)
+        self._lengths += 1
+        self._check_finite("observation", self._obs)
+        self._check_finite("reward", rewards)
+        self._returns += rewards
+        self._steps_sampled += 1
+        self._counted["steps"] += self.num_envs
+        self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
+        done = terminated | truncated
+        final_obs, final_state = self._obs[done], None
+        if done.any():
+            end = self._state()
+            final_state = None if end is None else end[done]
+            self._finish(done if counted is None else done & counted, info.get(EPISODE_METRICS, {}))
+            self._returns[done], self._lengths[done], self._started[done] = 0.0, 0, time.time()
+            self._obs, _ = self.env.reset(mask=done)
+            self._check_finite("observation", self._obs)
+        elif state is not None:
+            final_state = state[:0]
+        return (obs, state, actions, rewards, terminated, truncated), (final_obs, final_state)
+
+    def _state(self) -> NDArray[np.float32] | None:
+        assert self.env is not None
+        return self.env.state("world") if self.team.state_size else None
+
+    def _act(self, obs: NDArray[np.float32], explore: bool, random_actions: bool) -> NDArray[np.float32]:
+        """The agents' choices in [-1, 1], `(E, N, A)`."""
+        if random_actions:
+            shape = (*obs.shape[:2], self.team.action_size)
+            return (torch.rand(shape, generator=self._generator) * 2.0 - 1.0).numpy()
+        with self.metrics.log_time(RLMODULE_INFERENCE_TIMER), torch.no_grad():
+            device = self.actors.flat.device
+            actions = self.actors(self.actors.params, (torch.from_numpy(obs).to(device), 1)).cpu()
+            if explore:
+                actions = self.exploration(actions, self.num_env_steps_sampled_lifetime, self._generator)
+        return actions.numpy()
+
+    def _check_finite(self, what: str, values: NDArray[np.float32]) -> None:
+        if np.isfinite(values).all():
+            return
+        copy, agent = np.argwhere(~np.isfinite(values))[0][:2]
+        raise ValueError(
+            f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._lengths[copy]} of its "
+            f"episode in environment copy {copy} (runner {self.worker_index}): {values[copy, agent]}."
+        )
+
+    def _finish(self, done: NDArray[np.bool_], metrics: dict[str, NDArray[np.float32]]) -> None:
+        now = time.time()
+        for copy in np.flatnonzero(done):
+            self._counted["episodes"] += 1
+            self._done_episodes.append(
+                {
+                    "returns": self._returns[copy].copy(),
+                    "length": int(self._lengths[copy]),
+                    "seconds": now - self._started[copy],
+                    EPISODE_METRICS: {name: float(value[copy]) for name, value in metrics.items()},
+                }
+            )
+
+    @override(EnvRunner)
+    def get_metrics(self) -> Any:
+        """RLlib's result keys for what was sampled since the last call, and each episode's own metrics."""
+        steps, episodes = self._counted["steps"], self._counted["episodes"]
+        by_agent = dict.fromkeys(self.team.agents, steps)
+        by_module: dict[str, int] = {}
+        for mid in self.module_ids:
+            by_module[mid] = by_module.get(mid, 0) + steps
+        for name, value in (
+            (NUM_ENV_STEPS_SAMPLED, steps),
+            (NUM_EPISODES, episodes),
+            (NUM_AGENT_STEPS_SAMPLED, by_agent),
+            (NUM_MODULE_STEPS_SAMPLED, by_module),
+        ):
+            self._log(name, value, reduce="sum")
+        for name, value in (
+            (NUM_EPISODES_LIFETIME, episodes),
+            (NUM_AGENT_STEPS_SAMPLED_LIFETIME, by_agent),
+            (NUM_MODULE_STEPS_SAMPLED_LIFETIME, by_module),
+        ):
+            self._log(name, value, reduce="lifetime_sum")
+        self.metrics.log_value(NUM_ENV_STEPS_SAMPLED_LIFETIME, steps, reduce="lifetime_sum", with_throughput=True)
+        self.metrics.log_value(WEIGHTS_SEQ_NO, self._weights_seq_no, window=1)
+        # The results merge all runners' windows into one.
+        window = max(1, math.ceil(self.config.metrics_num_episodes_for_smoothing / max(1, self.num_workers)))
+        for episode in self._done_episodes:
+            total, length = float(episode["returns"].sum()), episode["length"]
+            agents = dict(zip(self.team.agents, map(float, episode["returns"]), strict=True))
+            modules: dict[str, float] = {}
+            for mid, value in zip(self.module_ids, episode["returns"], strict=True):
+                modules[mid] = modules.get(mid, 0.0) + float(value)
+            self.metrics.log_dict(
+                {
+                    EPISODE_LEN_MEAN: length,
+                    EPISODE_RETURN_MEAN: total,
+                    EPISODE_DURATION_SEC_MEAN: episode["seconds"],
+                    EPISODE_AGENT_RETURN_MEAN: agents,
+                    EPISODE_AGENT_STEPS: dict.fromkeys(self.team.agents, length),
+                    EPISODE_MODULE_RETURN_MEAN: modules,
+                    # A metric an episode has no value for (say, a goal never reached) is left out of the mean.
+                    EPISODE_METRICS: {k: v for k, v in episode[EPISODE_METRICS].items() if math.isfinite(v)},
+                },
+                window=window,
+            )
+            self.metrics.log_dict({EPISODE_LEN_MIN: length, EPISODE_RETURN_MIN: total}, reduce="min", window=window)
+            self.metrics.log_dict({EPISODE_LEN_MAX: length, EPISODE_RETURN_MAX: total}, reduce="max", window=window)
+        self._counted = {"steps": 0, "episodes": 0}
+        self._done_episodes.clear()
+        return self.metrics.reduce()
+
+    def _log(self, name: str, value: int | dict[str, int], **how: Any) -> None:
+        if isinstance(value, dict):
+            self.metrics.log_dict(value, key=name, **how)
+        else:
+            self.metrics.log_value(name, value, **how)
+
+    @override(EnvRunner)
+    def get_spaces(self) -> dict[str, tuple[gym.Space[Any], gym.Space[Any]]]:
+        """The spaces of every module, and under RLlib's own key those of every agent."""
+        observation, action = self.team.observation_space, self.team.action_space
+        return {
+            INPUT_ENV_SPACES: (
+                gym.spaces.Dict([(agent, observation) for agent in self.team.agents]),
+                gym.spaces.Dict([(agent, action) for agent in self.team.agents]),
+            ),
+            **{mid: (observation, action) for mid in self.module_ids},
+        }
+
+    @override(EnvRunner)
+    def assert_healthy(self) -> None:
+        """Checks that there is something to sample from and to act with."""
+        assert self.env is not None and self.module is not None
+
+    @override(EnvRunner)
+    def stop(self) -> None:
+        """Closes the environment."""
+        if self.env is not None:
+            self.env.close()
+
+    @override(Checkpointable)
+    def get_state(
+        self,
+        components: str | Collection[str] | None = None,
+        *,
+        not_components: str | Collection[str] | None = None,
+        **kwargs: Any,
+    ) -> dict[str, Any]:
+        """Weights, step count, and where the copies are in their episodes (if the environment can be pickled)."""
+        state: dict[str, Any] = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self.num_env_steps_sampled_lifetime}
+        if self.module is not None and self._check_component(COMPONENT_RL_MODULE, components, not_components):
+            state[COMPONENT_RL_MODULE] = self.module.get_state(
+                components=self._get_subcomponents(COMPONENT_RL_MODULE, components),
+                not_components=self._get_subcomponents(COMPONENT_RL_MODULE, not_components),
+                **kwargs,
+            )
+            state[WEIGHTS_SEQ_NO] = self._weights_seq_no
+        if self.env is not None and self._check_component(COMPONENT_SAMPLING, components, not_components):
+            state[COMPONENT_SAMPLING] = {
+                "in_evaluation": self.config.in_evaluation,
+                "generator": self._generator.get_state().numpy(),
+                "env": snapshot(self.env),
+                **{name: getattr(self, name) for name in _SAMPLING_STATE},
+            }
+        return state
+
+    @override(Checkpointable)
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a saved state; an environment that could not be saved starts new episodes."""
+        if COMPONENT_RL_MODULE in state and self.module is not None:
+            seq_no = state.get(WEIGHTS_SEQ_NO, 0)
+            if seq_no == 0 or self._weights_seq_no < seq_no:
+                self.module.set_state(state[COMPONENT_RL_MODULE])
+            self._weights_seq_no = max(self._weights_seq_no, seq_no)
+        if NUM_ENV_STEPS_SAMPLED_LIFETIME in state:
+            self.num_env_steps_sampled_lifetime = state[NUM_ENV_STEPS_SAMPLED_LIFETIME]
+        sampling = state.get(COMPONENT_SAMPLING)
+        # RLlib hands the training runner's state to the evaluation runner, too; its episodes are not for it.
+        if sampling is None or self.env is None or sampling["in_evaluation"] != self.config.in_evaluation:
+            return
+        if sampling["env"] is None or len(sampling["_returns"]) != self.num_envs:
+            self._needs_reset = True
+            return
+        self._generator.set_state(torch.from_numpy(sampling["generator"]))
+        self.env = pickle.loads(sampling["env"])
+        for name in _SAMPLING_STATE:
+            setattr(self, name, pickle.loads(pickle.dumps(sampling[name])))
+
+    @override(Checkpointable)
+    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """What builds this runner again."""
+        return (), {"config": self.config}
+
+    @override(Checkpointable)
+    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
+        """The agents' modules."""
+        return [(COMPONENT_RL_MODULE, self.module)]
+
+
+_SAMPLING_STATE = (
+    "_obs",
+    "_needs_reset",
+    "_returns",
+    "_lengths",
+    "_started",
+    "_steps_sampled",
+    "_source",
+    "_counted",
+    "_done_episodes",
+)
