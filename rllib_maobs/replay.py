@@ -151,7 +151,8 @@ class JointReplayBuffer(Checkpointable):
             column = self._columns[name]
             if values is None:
                 raise ValueError(f"The replay buffer stores {name!r}, but none was given.")
-            flat = torch.as_tensor(values).reshape(rows.size, *column.shape[1:]).to(column)
+            # np.require: arrays from a remote runner are read-only, which torch warns of.
+            flat = torch.from_numpy(np.require(values, np.float32, "W")).reshape(rows.size, *column.shape[1:])
             column[first : first + split] = flat[:split]
             column[: rows.size - split] = flat[split:]
 

@@ -173,6 +173,10 @@ class JointConfig(AlgorithmConfig):
         one_of("critic_state", self.critic_state, CRITIC_STATES)
         Exploration.from_dict(self.exploration)
         settings = self.model_config
+        for name in settings:
+            legal = ("hidden_sizes", "activation", "exploration", "critic_state_size", "critic_action_size")
+            if name not in legal:
+                raise ValueError(f"Unknown model_config setting {name!r}; legal are {', '.join(legal)}.")
         one_of("model_config['activation']", settings["activation"], ACTIVATIONS)
         hidden = settings["hidden_sizes"]
         if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
@@ -191,6 +195,15 @@ class JointConfig(AlgorithmConfig):
             raise ValueError("normalize_actions must be True: the actors' actions are in [-1, 1].")
         self._inspect_environment()
         super().validate()
+
+    @override(AlgorithmConfig)
+    def build_algo(self, env: Any = None, use_copy: bool = True) -> Any:
+        """Builds the algorithm, after all settings have been checked."""
+        if env is not None:
+            self.environment(env)
+        # RLlib resets whatever equals -1 (its mark of a deprecated setting) before it validates.
+        self.copy(copy_frozen=False).validate()
+        return super().build_algo(use_copy=use_copy)
 
     def _inspect_environment(self) -> None:
         """Makes one copy of the environment to learn its team, and names the policies after the agents."""

@@ -1,0 +1,1 @@
+"""Benchmarks: each is a script with its command in its docstring."""

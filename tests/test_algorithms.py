@@ -1,0 +1,265 @@
+"""Whole algorithms: update ratio, evaluation, checkpoints, remote runners, foreign environments, wrong settings."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+import torch
+from gymnasium.spaces import Discrete
+from mpe2 import simple_spread_v3
+from ray import tune
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.core.rl_module.rl_module import RLModule
+
+import rllib_maobs as maobs
+from rllib_maobs.learner import Batch
+from tests.conftest import ALGORITHMS, small_config
+from tests.test_runner import TwoAgents
+
+
+def updates_of(algo: Algorithm) -> int:
+    return int(algo.metrics.peek(("learners", "__all_modules__", "num_updates_lifetime"), default=0))
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_training_reports_what_rllib_users_look_for(ray_session: None, algorithm: str) -> None:
+    config = small_config(algorithm, horizon=10)
+    config.evaluation(
+        evaluation_interval=1,
+        evaluation_duration=3,
+        evaluation_config=maobs.JointConfig.overrides(env_config={"horizon": 20}, num_envs_per_env_runner=3),
+    )
+    algo = config.build_algo()
+    start = algo._learner.actors.flat.detach().clone()
+    result = algo.train()
+    assert not torch.equal(algo._learner.actors.flat, start)
+    assert result["num_env_steps_sampled_lifetime"] == 40
+    sampled, evaluated = result["env_runners"], result["evaluation"]["env_runners"]
+    assert sampled["num_episodes"] == 4 and evaluated["num_episodes"] == 3
+    assert sampled["episode_len_mean"] == 10 and evaluated["episode_len_mean"] == 20
+    by_agent = evaluated["agent_episode_returns_mean"]
+    assert sum(by_agent.values()) == pytest.approx(evaluated["episode_return_mean"])
+    assert 0 <= evaluated["episode_metrics"]["coverage"] <= 1
+    assert result["learners"]["agent_0"]["critic_loss"] > 0
+    assert result["learners"]["__all_modules__"]["num_updates_lifetime"] == 40 - 16
+    assert "learner_update_timer" in result["timers"]
+    algo.stop()
+
+
+@pytest.mark.parametrize(
+    ("copies", "fragment", "ratio"), [(1, 1, 1.0), (7, 3, 1.0), (64, 1, 1.0), (5, 4, 0.3), (3, 1, 2.5), (8, 16, 0.01)]
+)
+def test_updates_per_env_step_is_exact_over_time(ray_session: None, copies: int, fragment: int, ratio: float) -> None:
+    config = small_config("iddpg")
+    config.env_runners(num_envs_per_env_runner=copies, rollout_fragment_length=fragment)
+    config.training(updates_per_env_step=ratio, num_steps_sampled_before_learning_starts=100)
+    config.rl_module(model_config={"hidden_sizes": (8,)})
+    config.reporting(min_sample_timesteps_per_iteration=1)
+    algo = config.build_algo()
+    steps = 0
+    while steps < 1100:
+        steps = int(algo.train()["num_env_steps_sampled_lifetime"])
+        assert algo._progress["updates"] == max(0, math.floor(ratio * (steps - 100)))
+    assert updates_of(algo) == math.floor(ratio * (steps - 100))
+    algo.stop()
+
+
+def test_random_steps_come_first(ray_session: None) -> None:
+    config = small_config("maddpg").training(num_random_steps=40, updates_per_env_step=0)
+    algo = config.training(exploration={"epsilon": 0.0, "noise": 0.0}).build_algo()
+    algo.train()
+    algo.train()
+    obs, actions = (algo.replay_buffer._columns[k][:80] for k in ("obs", "actions"))
+    greedy = algo.env_runner.actors(algo.env_runner.actors.params, (obs, 1))
+    assert (actions - greedy)[:40].abs().mean() > 0.3
+    assert actions[:40].std().item() == pytest.approx(1 / math.sqrt(3), abs=0.02)
+    torch.testing.assert_close(actions[40:], greedy[40:])
+    algo.stop()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_restored_run_goes_on_exactly_as_the_first(ray_session: None, algorithm: str, tmp_path: Path) -> None:
+    config = small_config(algorithm, horizon=15)
+    config.evaluation(evaluation_interval=1, evaluation_duration=2)
+    algo = config.build_algo()
+    algo.train()
+    path = algo.save_to_path(tmp_path / "checkpoint")
+    restored = Algorithm.from_checkpoint(path)
+    assert restored._learner.actors.flat.data_ptr() == restored.env_runner.actors.flat.data_ptr()
+    for _ in range(2):
+        first, second = algo.train(), restored.train()
+        assert torch.equal(algo._learner.actors.flat, restored._learner.actors.flat)
+        assert torch.equal(algo._learner.target_critics.flat, restored._learner.target_critics.flat)
+        assert first["env_runners"]["episode_return_mean"] == second["env_runners"]["episode_return_mean"]
+        assert first["num_env_steps_sampled_lifetime"] == second["num_env_steps_sampled_lifetime"]
+    obs = np.random.default_rng(0).normal(size=(4, 18)).astype(np.float32)
+    for agent in algo.config.module_ids:
+        a, b = (x.get_module(agent).forward_inference({"obs": obs})["actions"] for x in (algo, restored))
+        assert torch.equal(a, b)
+    algo.stop()
+    restored.stop()
+
+
+def test_without_a_saved_buffer_learning_waits_until_it_is_refilled(ray_session: None, tmp_path: Path) -> None:
+    algo = small_config("maddpg").training(store_buffer_in_checkpoints=False).build_algo()
+    algo.train()
+    path = Path(algo.save_to_path(tmp_path / "checkpoint"))
+    assert not (path / "replay_buffer").exists()
+    restored = Algorithm.from_checkpoint(str(path))
+    assert len(restored.replay_buffer) == 0
+    restored.train()
+    assert restored._progress == {"env_steps": 80, "learning_starts": 56, "updates": 24}
+    algo.stop()
+    restored.stop()
+
+
+def test_one_agent_leaves_a_checkpoint_in_three_lines(ray_session: None, tmp_path: Path) -> None:
+    algo = small_config("maddpg").build_algo()
+    algo.train()
+    checkpoint = algo.save_to_path(tmp_path / "checkpoint")
+    obs = np.random.default_rng(0).normal(size=(1, 18)).astype(np.float32)
+
+    module = RLModule.from_checkpoint(f"{checkpoint}/learner_group/learner/rl_module/agent_0")
+    action = module.forward_inference({"obs": obs})["actions"]
+
+    assert action.shape == (1, 5) and action.abs().max() <= 1
+    assert torch.equal(action, algo.get_module("agent_0").forward_inference({"obs": obs})["actions"])
+    algo.stop()
+
+
+def test_remote_runners_sample_learn_and_survive_a_kill(ray_session: None) -> None:
+    config = small_config("maddpg", horizon=10)
+    config.env_runners(num_env_runners=1, num_envs_per_env_runner=4, rollout_fragment_length=5)
+    algo = config.build_algo()
+    assert algo.train()["num_env_steps_sampled_lifetime"] == 40
+    (weights,) = algo.env_runner_group.foreach_env_runner(
+        lambda r: r.actors.flat.detach().clone(), local_env_runner=False
+    )
+    assert torch.equal(weights, algo._learner.actors.flat)
+    (actor,) = algo.env_runner_group._worker_manager.actors().values()
+    ray.kill(actor, no_restart=False)
+    steps = updates = 0
+    for _ in range(20):
+        result = algo.train()
+        steps, updates = int(result["num_env_steps_sampled_lifetime"]), algo._progress["updates"]
+        if steps >= 120:
+            break
+    assert steps >= 120 and updates == algo._progress["env_steps"] - 16
+    algo.stop()
+
+
+def test_a_remote_environments_error_is_raised_not_retried(ray_session: None) -> None:
+    config = small_config("iddpg").environment(TwoAgents, env_config={"nan_at": 3}).env_runners(num_env_runners=1)
+    algo = config.build_algo()
+    with pytest.raises(ValueError, match="observation of agent 'right' is not finite at step 3"):
+        algo.train()
+    algo.stop()
+
+
+def test_a_foreign_parallel_env_is_trained(ray_session: None) -> None:
+    tune.register_env("mpe2_spread", lambda _: simple_spread_v3.parallel_env(continuous_actions=True, max_cycles=8))
+    config = small_config("maddpg-l").environment("mpe2_spread").training(critic_state="world")
+    algo = config.build_algo()
+    result = algo.train()
+    assert result["env_runners"]["num_episodes"] == 4
+    assert result["learners"]["__all_modules__"]["num_updates_lifetime"] == 24
+    algo.stop()
+
+
+def test_names_survive_a_restart_of_ray(ray_session: None, tmp_path: Path) -> None:
+    maobs.register()
+    maobs.register()
+    config = small_config("maddpg-l").evaluation(evaluation_interval=1, evaluation_duration=1)
+    results = tune.Tuner(
+        "MADDPGL",
+        param_space=config,
+        run_config=tune.RunConfig(stop={"training_iteration": 2}, storage_path=str(tmp_path), verbose=0),
+    ).fit()
+    assert not results.errors
+    assert results[0].metrics["num_env_steps_sampled_lifetime"] == 80
+
+
+def test_with_one_agent_all_algorithms_are_ddpg(ray_session: None) -> None:
+    """One agent's observation is the state and its action the joint action: the same numbers come out."""
+    actors = []
+    for algorithm in ALGORITHMS:
+        algo = small_config(algorithm, num_agents=1).build_algo()
+        start = algo._learner.actors.flat.detach().clone()
+        algo.train()
+        actors.append(algo._learner.actors.flat.detach().clone())
+        assert not torch.equal(actors[-1], start)
+        algo.stop()
+    assert all(torch.equal(actor, actors[0]) for actor in actors)
+
+
+class DiscreteAgents(TwoAgents):
+    def __init__(self, config: dict[str, Any]) -> None:
+        super().__init__(config)
+        self.action_spaces = dict.fromkeys(self.agents, Discrete(5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.training(actor_lr=-1e-3), r"actor_lr must be a finite number in \(0, inf\), not -0.001"),
+        (lambda c: c.training(critic_lr=float("nan")), r"critic_lr must be a finite number"),
+        (lambda c: c.training(tau=1.5), r"tau must be a finite number in \(0, 1\], not 1.5"),
+        (lambda c: c.training(gamma=float("inf")), r"gamma must be a finite number in \[0, 1\]"),
+        (lambda c: c.training(updates_per_env_step=-1), r"updates_per_env_step must be a finite number in \[0, inf\)"),
+        (lambda c: c.training(train_batch_size_per_learner=0), r"train_batch_size_per_learner must be .* \[1, inf\)"),
+        (lambda c: c.training(train_batch_size_per_learner=9_000), r"\(9000\) must not be larger .*capacity \(5000\)"),
+        (lambda c: c.training(num_steps_sampled_before_learning_starts=9_000), r"\(9000\) must not be larger"),
+        (lambda c: c.training(critic_state="all"), r"critic_state must be one of 'observations', 'world', not 'all'"),
+        (lambda c: c.training(other_agents_actions="mine"), r"must be one of 'replay', 'current', 'joint', not 'mine'"),
+        (lambda c: c.training(exploration={"eps": 0.1}), r"Unknown exploration setting 'eps'; legal are"),
+        (lambda c: c.training(grad_clip=1.0), r"grad_clip must be None"),
+        (lambda c: c.rl_module(model_config={"activation": "step"}), r"activation'\] must be one of 'relu', 'tanh'"),
+        (lambda c: c.rl_module(model_config={"hidden_sizes": ()}), r"hidden_sizes'\] must be positive integers"),
+        (lambda c: c.rl_module(model_config={"hiden": (8,)}), r"Unknown model_config setting 'hiden'; legal are"),
+        (lambda c: c.learners(num_learners=1), r"num_learners must be 0, not 1"),
+        (lambda c: c.multi_agent(policies={"all"}, policy_mapping_fn=lambda a, e, **k: "all"), r"policy of its own"),
+        (
+            lambda c: c.environment("maobs/spread-4a"),
+            r"Unknown environment 'maobs/spread-4a'; legal are maobs/.*, maobs/spread-3a",
+        ),
+        (lambda c: c.environment(None), r"No environment: set one with"),
+        (lambda c: c.environment(env_config={"num_agnts": 4}), r"num_agnts.*num_agents"),
+        (lambda c: c.environment(TwoAgents, env_config={"sizes": (3, 4)}), r"'left' has 3 and 'right' has 4"),
+        (lambda c: c.environment(DiscreteAgents), r"action space of agent 'left' is Discrete\(5\); legal are"),
+        (lambda c: c.environment(TwoAgents).training(critic_state="world"), r'use critic_state="observations"'),
+    ],
+)
+def test_wrong_settings_are_refused_before_anything_starts(ray_session: None, change: Any, message: str) -> None:
+    config = small_config("maddpg")
+    with pytest.raises(ValueError, match=message):
+        change(config)
+        config.build_algo()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) -> None:
+    """The critic's input widths, for both kinds of state, are those of the family table."""
+    widths = {
+        "iddpg": {"observations": (18, 5), "world": (18, 5)},
+        "maddpg": {"observations": (54, 15), "world": (22, 15)},
+        "maddpg-l": {"observations": (54, 5), "world": (22, 5)},
+    }[algorithm]
+    for kind, want in widths.items():
+        algo = small_config(algorithm).training(critic_state=kind).build_algo()
+        critic = algo._learner.module["agent_0"].critic
+        assert (critic.state_size, critic.first.in_features - critic.state_size) == want
+        seen: list[Batch] = []
+        algo._learner.step = lambda batch, seen=seen: seen.append(batch) or {}
+        algo.train()
+        state = seen[0].state
+        if algorithm != "iddpg":
+            assert state.shape[-1] == want[0]
+        positions = seen[0].obs[..., 2:4].flatten(1)
+        if kind == "world" and algorithm != "iddpg":
+            torch.testing.assert_close(state[:, :6], positions)
+        elif kind == "observations":
+            torch.testing.assert_close(state, seen[0].obs.flatten(1))
+        algo.stop()

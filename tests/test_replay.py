@@ -1,0 +1,184 @@
+"""Replay: alignment of agents and episodes, true final observations, eviction, memory, resume."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rllib_maobs.replay import JointReplayBuffer
+
+N, O, A, S = 3, 4, 2, 5  # noqa: E741
+
+
+class Simulator:
+    """E copies whose every number tells copy, episode, step and agent; episodes of copy e last 3 + e steps."""
+
+    def __init__(self, copies: int, source: str = "r", length: int = 3) -> None:
+        self.copies, self.source, self.length = copies, source, length
+        self.episode = np.zeros(copies, dtype=int)
+        self.t = np.zeros(copies, dtype=int)
+        self.start = 0
+
+    def obs(self) -> np.ndarray:
+        code = np.arange(self.copies) * 10_000 + self.episode * 100 + self.t
+        return (code[:, None, None] + np.arange(N)[:, None] / 10 + np.zeros(O)).astype(np.float32)
+
+    def fragment(self, steps: int, state: bool = False) -> dict[str, Any]:
+        rows: dict[str, list[np.ndarray]] = {k: [] for k in ("obs", "actions", "rewards", "terminated", "truncated")}
+        finals, states, final_states = [], [], []
+        start = self.start
+        for _ in range(steps):
+            obs = self.obs()
+            rows["obs"].append(obs)
+            states.append(np.repeat(obs[:, 0, :1], S, axis=1))
+            rows["actions"].append(obs[:, :, :1] + np.arange(A, dtype=np.float32) / 100)
+            rows["rewards"].append(-obs[:, :, 0])
+            self.t += 1
+            over = self.t == self.length + np.arange(self.copies)
+            # Even episodes end by termination, odd ones by the time limit.
+            rows["terminated"].append(over & (self.episode % 2 == 0))
+            rows["truncated"].append(over & (self.episode % 2 == 1))
+            finals.append(self.obs()[over])
+            final_states.append(np.repeat(self.obs()[over][:, 0, :1], S, axis=1))
+            self.episode[over] += 1
+            self.t[over] = 0
+            self.start += 1
+        columns: dict[str, Any] = {k: np.stack(v) for k, v in rows.items()}
+        columns |= {"final_obs": np.concatenate(finals), "source": self.source, "start": start}
+        if state:
+            columns |= {"state": np.stack(states), "final_state": np.concatenate(final_states)}
+        return columns
+
+
+def check(batch: dict[str, torch.Tensor], copies: int, length: int = 3) -> None:
+    """Every sampled transition is one that the simulator made."""
+    code = batch["obs"][:, 0, 0].round().long()
+    copy, episode, t = code // 10_000, code // 100 % 100, code % 100
+    agents = torch.arange(N) / 10
+    torch.testing.assert_close(batch["obs"], (code[:, None, None] + agents[:, None]).expand(-1, N, O).float())
+    # The next observation is the one a step later in the same episode: the true last one at its end.
+    torch.testing.assert_close(batch["next_obs"], batch["obs"] + 1)
+    torch.testing.assert_close(batch["actions"], batch["obs"][:, :, :1] + torch.arange(A) / 100)
+    torch.testing.assert_close(batch["rewards"], -batch["obs"][:, :, 0])
+    over = t + 1 == length + copy
+    assert torch.equal(batch["terminated"][:, 0], (over & (episode % 2 == 0)).float())
+    assert copy.max() < copies
+
+
+@pytest.mark.parametrize("fragment", [1, 2, 7])
+@pytest.mark.parametrize("copies", [1, 4])
+def test_transitions_never_mix_episodes_copies_or_agents(copies: int, fragment: int) -> None:
+    buffer = JointReplayBuffer(10_000, N, O, A, seed=0)
+    simulator = Simulator(copies)
+    seen: set[int] = set()
+    for _ in range(60 // fragment):
+        buffer.add(**simulator.fragment(fragment))
+    for _ in range(30):
+        batch = buffer.sample((256,))
+        check(batch, copies)
+        seen |= set(batch["obs"][:, 0, 0].round().long().tolist())
+    # All steps are drawn but the last ones, whose next observation is not there yet.
+    steps = 60 // fragment * fragment * copies
+    assert steps - copies <= len(seen) <= steps
+
+
+def test_the_newest_step_waits_for_its_next_observation() -> None:
+    buffer = JointReplayBuffer(100, N, O, A, seed=0)
+    simulator = Simulator(1)
+    buffer.add(**simulator.fragment(1))
+    with pytest.raises(ValueError, match="no complete transition"):
+        buffer.sample((4,))
+    buffer.add(**simulator.fragment(1))
+    assert set(buffer.sample((50,))["obs"][:, 0, 0].tolist()) == {0.0}
+
+
+def test_an_empty_buffer_cannot_be_sampled() -> None:
+    with pytest.raises(ValueError, match="no complete transition"):
+        JointReplayBuffer(10, N, O, A).sample((4,))
+
+
+@pytest.mark.parametrize("capacity", [23, 40, 64])
+def test_old_rows_give_way_and_what_is_left_stays_true(capacity: int) -> None:
+    buffer = JointReplayBuffer(capacity, N, O, A, seed=0)
+    simulator = Simulator(3)
+    written: list[float] = []
+    for _ in range(100):
+        fragment = simulator.fragment(2)
+        buffer.add(**fragment)
+        written += [*fragment["obs"][..., 0, 0].ravel().tolist(), *fragment["final_obs"][:, 0, 0].tolist()]
+        if len(buffer) > 10:
+            batch = buffer.sample((64,))
+            check(batch, 3)
+            assert set(batch["obs"][:, 0, 0].tolist()) <= set(written[-capacity:])
+    assert len(buffer) == capacity
+
+
+def test_a_lost_fragment_is_not_bridged() -> None:
+    """A gap in a runner's steps, and a new runner in an old one's place, leave no transition across it."""
+    buffer = JointReplayBuffer(1000, N, O, A, seed=0)
+    simulator = Simulator(2, length=50)
+    buffer.add(**simulator.fragment(4))
+    simulator.fragment(3)  # sampled but never arrived
+    buffer.add(**simulator.fragment(4))
+    restarted = Simulator(2, source="other", length=50)
+    restarted.episode += 7
+    buffer.add(**restarted.fragment(4))
+    batch = buffer.sample((500,))
+    check(batch, 2, length=50)
+    assert {3, 10} & set((batch["obs"][:, 0, 0] % 10_000).long().tolist()) == set()
+
+
+def test_two_runners_interleave() -> None:
+    buffer = JointReplayBuffer(1000, N, O, A, seed=0)
+    first, second = Simulator(2, source="1", length=9), Simulator(2, source="2", length=9)
+    second.episode += 4
+    for _ in range(10):
+        buffer.add(**first.fragment(3))
+        buffer.add(**second.fragment(3))
+    check(buffer.sample((500,)), 2, length=9)
+
+
+def test_stored_states_go_with_their_observations() -> None:
+    buffer = JointReplayBuffer(200, N, O, A, S, seed=0)
+    simulator = Simulator(2)
+    for _ in range(10):
+        buffer.add(**simulator.fragment(3, state=True))
+    batch = buffer.sample((8, 16))
+    assert batch["state"].shape == (8, 16, S)
+    assert torch.equal(batch["state"][..., 0], batch["obs"][..., 0, 0])
+    assert torch.equal(batch["next_state"][..., 0], batch["next_obs"][..., 0, 0])
+
+
+def test_sampling_is_uniform() -> None:
+    buffer = JointReplayBuffer(50, N, O, A, seed=0)
+    buffer.add(**Simulator(1, length=40).fragment(41))
+    counts = np.bincount(buffer.sample((40_000,))["obs"][:, 0, 0].long().numpy(), minlength=40)
+    assert counts.size == 40
+    assert np.abs(counts - 1000).max() < 5 * np.sqrt(1000)
+
+
+def test_a_restored_buffer_goes_on_as_the_first() -> None:
+    simulator = Simulator(2)
+    buffer = JointReplayBuffer(64, N, O, A, seed=0)
+    for _ in range(20):
+        buffer.add(**simulator.fragment(3))
+    restored = JointReplayBuffer(64, N, O, A, seed=99)
+    restored.set_state(buffer.get_state())
+    more = simulator.fragment(3)
+    for b in (buffer, restored):
+        b.add(**more)
+    first, second = buffer.sample((100,)), restored.sample((100,))
+    assert all(torch.equal(first[k], second[k]) for k in first)
+    with pytest.raises(ValueError, match="'capacity': 64"):
+        JointReplayBuffer(65, N, O, A).set_state(buffer.get_state())
+
+
+def test_too_small_a_buffer_says_so() -> None:
+    with pytest.raises(ValueError, match="raise replay_buffer_capacity"):
+        JointReplayBuffer(5, N, O, A).add(**Simulator(2).fragment(3))
+
+
+def test_half_a_million_joint_steps_of_nine_agents_fit() -> None:
+    assert JointReplayBuffer(500_000, 9, 50, 5).nbytes <= 1.3e9
+    assert JointReplayBuffer(500_000, 9, 50, 5, 66).nbytes <= 1.3e9
