@@ -76,6 +76,15 @@ def test_free_motion_by_hand():
     np.testing.assert_allclose(world.position[0, 0], [0.125, -0.02], rtol=1e-14)
 
 
+def test_solid_damps_once_and_pushes_in_five_parts():
+    world = World(1, bodies(1), physics="solid")
+    world.velocity[0, 0] = [1.0, 0.0]
+    world.step(np.array([[[5.0, 0.0]]]))
+    # v = 0.75, then + 0.02 * 5 five times; p sums 0.02 * v over the five parts.
+    np.testing.assert_allclose(world.velocity[0, 0], [1.25, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(world.position[0, 0], [0.02 * (0.85 + 0.95 + 1.05 + 1.15 + 1.25), 0.0], rtol=1e-14)
+
+
 def test_explicit_order_moves_before_it_accelerates():
     world = World(1, bodies(1), integrator="explicit")
     world.velocity[0, 0] = [1.0, 0.0]
@@ -202,6 +211,22 @@ def test_walls_hold_against_a_crowd():
         world.step(5.0 * (corner - world.position))
         assert (np.abs(world.position) <= corner + 1e-12).all()
     assert np.isfinite(world.velocity).all()
+
+
+@pytest.mark.parametrize("physics", ["mpe", "solid"])
+def test_limit_holds_its_own_group_alone(physics):
+    held = Bodies("held", 1, 0.1, movable=True, limit=0.5)
+    world = World(2, [Bodies("agent", 1, 0.1, movable=True), held], physics=physics)
+    world.position[:, 0], world.position[:, 1] = [0.0, 0.45], [0.45, -0.45]
+    world.velocity[:] = [2.0, 0.5]
+    world.velocity[1, 1] = [-2.0, -0.5]
+    for _ in range(3):
+        world.step(np.zeros((2, 2, 2)))
+    assert (world.position[:, 0] > 0.5).any(axis=1).all()
+    assert world.position[0, 1, 0] == 0.5 and world.velocity[0, 1, 0] == 0.0
+    assert -0.45 < world.position[0, 1, 1] < -0.3 and world.velocity[0, 1, 1] > 0.0  # along the edge it slides
+    assert world.position[1, 1, 1] == -0.5 and world.velocity[1, 1, 1] == 0.0
+    assert world.velocity[1, 1, 0] < 0.0
 
 
 @pytest.mark.parametrize("physics", ["mpe", "solid"])

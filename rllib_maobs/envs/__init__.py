@@ -2,10 +2,14 @@
 
 from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.pettingzoo_env import MAObsParallelEnv, parallel_env
+from rllib_maobs.envs.predator_prey import PredatorPrey
+from rllib_maobs.envs.recording import Recorder
 from rllib_maobs.envs.registry import SCENARIOS, make_scenario, make_vec, register_scenario
 from rllib_maobs.envs.rllib_env import EpisodeMetricsCallback, MAObsEnv
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
+from rllib_maobs.envs.simple_tunnel import SimpleTunnel
 from rllib_maobs.envs.spread import Spread
+from rllib_maobs.envs.tunnel import Tunnel
 from rllib_maobs.envs.vector import VectorEnv
 from rllib_maobs.envs.world import Bodies, Wall, World
 
@@ -16,10 +20,14 @@ __all__ = [
     "MAObsEnv",
     "MAObsParallelEnv",
     "Outcome",
+    "PredatorPrey",
     "Range",
+    "Recorder",
     "Scenario",
     "ScenarioOptions",
+    "SimpleTunnel",
     "Spread",
+    "Tunnel",
     "VectorEnv",
     "Wall",
     "World",

@@ -15,9 +15,10 @@ _START = {"min": np.inf, "max": -np.inf, "first": np.inf}
 class EpisodeTracker:
     """Metrics of the running episode of each copy.
 
-    Every scenario reports the following, and what it declares in `Scenario.metrics`:
+    Every scenario reports the following, and what it declares in `Scenario.metrics`. Agents are here those of
+    the team, the first group of bodies; contacts of predators with their prey, for one, are no collisions.
 
-    - `success`: 1 if the task is solved at the end of the episode.
+    - `success`: 1 if the task is solved at the end of the episode, unless the scenario says otherwise.
     - `time_to_goal`: first step at which the task is solved; the horizon if it never is.
     - `collisions_agents`: pairs of agents in contact, summed over the steps.
     - `collisions_obstacles`, `collisions_walls`: contacts of agents with them, summed over agents and steps.
@@ -36,9 +37,14 @@ class EpisodeTracker:
     """
 
     def __init__(self, scenario: Scenario, world: World) -> None:  # type: ignore[type-arg]
-        self._num_agents = len(scenario.agents)
+        team = world.groups[0]
+        self._team, self._num_agents = team.name, team.count
         self._horizon = scenario.options.horizon
-        self._groups = [name for name in ("agent", "obstacle") if name in world.index]
+        # What the team should keep clear of: itself and what does not move.
+        num_colliders = world.gap.shape[-1]
+        movers = range(team.count, min(world.num_movers, num_colliders))
+        keep_clear = [k for k in range(num_colliders) if k not in movers]
+        self._keep_clear: slice | list[int] = keep_clear if movers else slice(None)
         own = {
             "success": "last",
             "time_to_goal": "first",
@@ -48,7 +54,7 @@ class EpisodeTracker:
             "min_clearance": "min",
             "return_agent_0": "sum",
         }
-        self._reduce: Mapping[str, str] = own | dict(scenario.metrics)
+        self._reduce: Mapping[str, str] = own | dict(scenario.metric_reductions())
         for name, how in self._reduce.items():
             if how not in _REDUCTIONS:
                 raise ValueError(f"metric {name!r} has reduction {how!r}; legal: {', '.join(_REDUCTIONS)}")
@@ -88,14 +94,12 @@ class EpisodeTracker:
 
         step: dict[str, NDArray[np.generic]] = dict(outcome.metrics)
         step["success"] = step["time_to_goal"] = outcome.success
-        step["collisions_agents"] = world.contacts("agent")[:, agents].sum(axis=1) / 2.0
+        step["collisions_agents"] = world.contacts(self._team)[:, agents].sum(axis=1) / 2.0
         step["collisions_obstacles"] = self._count(world, "obstacle")
         step["collisions_walls"] = world.wall_contacts()[:, agents].sum(axis=1)
-        clearance = world.gap[:, agents].reshape(world.num_envs, -1).min(axis=1)
-        if world.walls:
-            wall_clearance = world.wall_gap[:, agents].reshape(world.num_envs, -1).min(axis=1)
-            clearance = np.minimum(clearance, wall_clearance)
-        step["min_clearance"] = clearance
+        gaps = world.gap[:, agents, self._keep_clear], world.wall_gap[:, agents]
+        clearances = [gap.min(axis=(1, 2), initial=np.inf) for gap in gaps]
+        step["min_clearance"] = np.minimum(*clearances)
         step["return_agent_0"] = outcome.rewards[:, 0]
 
         for how, names in self._names.items():

@@ -59,9 +59,7 @@ def build_options(cls: type[T], values: dict[str, Any], owner: str) -> T:
     legal = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     for name in values:
         if name not in legal:
-            raise ValueError(
-                f"{owner} has no option {name!r}{closest(name, legal)}; legal options: {', '.join(legal)}"
-            )
+            raise ValueError(f"{owner} has no option {name!r}{closest(name, legal)}; legal options: {', '.join(legal)}")
     return cls(**{name: _check(value, hints[name], name, owner) for name, value in values.items()})
 
 
@@ -90,15 +88,11 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
     if hint is type(None):
         return value is None, None
     if hint is bool:
-        return isinstance(value, bool | np.bool_), bool(value) if isinstance(
-            value, bool | np.bool_
-        ) else value
+        return isinstance(value, bool | np.bool_), bool(value) if isinstance(value, bool | np.bool_) else value
     if isinstance(value, bool | np.bool_):
         return False, value
     if hint is int:
-        return isinstance(value, numbers.Integral), int(value) if isinstance(
-            value, numbers.Integral
-        ) else value
+        return isinstance(value, numbers.Integral), int(value) if isinstance(value, numbers.Integral) else value
     if hint is float:
         finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
         return finite, float(value) if finite else value
@@ -111,6 +105,4 @@ def _describe(hint: Any) -> str:
         return f"{_describe(inner)} {limits}"
     if get_origin(hint) is Literal:
         return ", ".join(repr(value) for value in get_args(hint))
-    return {int: "an integer", float: "a number", bool: "True or False", type(None): "None"}.get(
-        hint, str(hint)
-    )
+    return {int: "an integer", float: "a number", bool: "True or False", type(None): "None"}.get(hint, str(hint))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from rllib_maobs.envs.registry import make_scenario
+from rllib_maobs.envs.rendering import FRAMES_PER_SECOND, RENDER_MODES, Frame
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.envs.single import ByAgent, SingleCopy
 
@@ -21,18 +22,21 @@ class MAObsParallelEnv(ParallelEnv):
 
     Args:
         scenario: The task.
+        render_mode: None, "rgb_array" (`render()` returns a picture (H, W, 3)) or "human" (a window shows every
+            step, in real time).
     """
 
     metadata: ClassVar[dict[str, Any]] = {
         "name": "rllib_maobs",
         "is_parallelizable": True,
-        "render_modes": [],
+        "render_modes": list(RENDER_MODES),
+        "render_fps": FRAMES_PER_SECOND,
     }
 
-    def __init__(self, scenario: Scenario[Any]) -> None:
+    def __init__(self, scenario: Scenario[Any], render_mode: str | None = None) -> None:
         self.scenario = scenario
-        self.render_mode = None
-        self._copy = SingleCopy(scenario)
+        self.render_mode = render_mode
+        self._copy = SingleCopy(scenario, render_mode)
         self.possible_agents = list(scenario.agents)
         self.agents: list[str] = []
         low_high = np.full(self._copy.env.state_size(), np.inf, np.float32)
@@ -46,9 +50,7 @@ class MAObsParallelEnv(ParallelEnv):
         """Return the action space of an agent."""
         return self._copy.env.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[ByAgent, ByAgent]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByAgent, ByAgent]:
         """Begin an episode.
 
         Args:
@@ -82,16 +84,31 @@ class MAObsParallelEnv(ParallelEnv):
             infos,
         )
 
+    def render(self) -> Frame | None:
+        """Return a picture, or None in mode "human"; see `SingleCopy.render`."""
+        return self._copy.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._copy.close()
+
+    def heuristic(self) -> ByAgent:
+        """Return the actions of the scenario's hand-written policy by agent; see `Scenario.heuristic`."""
+        return self._copy.heuristic()
+
     def state(self, kind: str | None = None) -> NDArray[np.float32]:
         """Return the (S,) global state; see `VectorEnv.state`."""
         return self._copy.state(kind)
 
 
-def parallel_env(scenario: str | type[Scenario[Any]], **options: Any) -> MAObsParallelEnv:
+def parallel_env(
+    scenario: str | type[Scenario[Any]], render_mode: str | None = None, **options: Any
+) -> MAObsParallelEnv:
     """Make a PettingZoo ParallelEnv.
 
     Args:
         scenario: A registered id, or a subclass of `Scenario`.
+        render_mode: None, "rgb_array" or "human", see `MAObsParallelEnv`.
         **options: Options of the scenario, documented in its class.
     """
-    return MAObsParallelEnv(make_scenario(scenario, **options))
+    return MAObsParallelEnv(make_scenario(scenario, **options), render_mode)

@@ -45,8 +45,8 @@ class Placement:
             each = np.asarray(members, np.intp)
             separation[np.ix_(each, each)] = self.room[each, None] + self.room[each] + clearance
             self._check_area(each, clearance)
-        # A body gives way to those before it, so that every round settles at least one more.
-        self._separation = np.tril(separation, -1)
+        np.fill_diagonal(separation, 0.0)
+        self._separation = separation
 
     def sample(self, rngs: Sequence[Generator]) -> FloatArray:
         """Draw one layout per generator.
@@ -71,8 +71,7 @@ class Placement:
             draw = (2.0 * draw - 1.0) * self.half_width[:, None]
             current = np.where(redraw[active, :, None], draw, position[active])
             position[active] = current
-            distance = self._distances(current)
-            overlaps = (distance < self._separation).any(axis=-1)
+            overlaps = self._losers(current, redraw[active])
             redraw[active] = overlaps
             active = active[overlaps.any(axis=-1)]
             if not active.size:
@@ -80,6 +79,27 @@ class Placement:
             if attempt % _ROUNDS_PER_LAYOUT == 0:
                 redraw[active] = True
         raise ValueError(self._describe_failure(position[active[0]]))
+
+    def _losers(self, position: FloatArray, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which bodies must move on: of two that overlap the later one, so that every round settles one.
+
+        Args:
+            position: (n, K, 2).
+            moved: (n, K), the bodies that moved since the others were found to be apart.
+
+        Returns:
+            (n, K).
+        """
+        copy, body = np.nonzero(moved)
+        points = position.view(np.complex128)[..., 0]
+        offset = points[copy]
+        offset -= points[copy, body, None]
+        squared = offset.real**2
+        squared += offset.imag**2
+        pair, other = np.nonzero(squared < self._separation[body] ** 2)
+        losers = np.zeros(moved.shape, bool)
+        losers[copy[pair], np.maximum(body[pair], other)] = True
+        return losers
 
     @staticmethod
     def _distances(position: FloatArray) -> FloatArray:
@@ -108,3 +128,57 @@ class Placement:
             f"{self.names[body]} is {missing[body, other]:.3f} too close to {self.names[other]}; "
             f"use fewer or smaller bodies, a larger range, or placement='mpe'"
         )
+
+
+class FixedLayout:
+    """The same positions in every episode, but for an optional jitter of the first bodies.
+
+    Args:
+        names: Name of each of the K bodies, for messages.
+        position: (K, 2).
+        room: (K,) radius that each body keeps free around it.
+        exclusive: Sets of body numbers; bodies of one set do not overlap.
+        noise: Bodies start uniformly within this distance of their place, along x and along y.
+        num_noisy: How many bodies, from the first, the noise moves.
+
+    Raises:
+        ValueError: If bodies of a set overlap, or may do so with noise; names them and the missing room.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        position: ArrayLike,
+        room: ArrayLike,
+        exclusive: Sequence[Sequence[int]] = (),
+        noise: float = 0.0,
+        num_noisy: int = 0,
+    ) -> None:
+        self.position: FloatArray = np.asarray(position, np.float64)
+        self.noise, self.num_noisy = noise, num_noisy
+        distance, radius = Placement._distances(self.position[None])[0], np.asarray(room, np.float64)
+        moves = np.where(np.arange(len(names)) < num_noisy, np.sqrt(2.0) * noise, 0.0)
+        for members in exclusive:
+            for k, first in enumerate(members):
+                for second in members[k + 1 :]:
+                    missing = radius[first] + radius[second] + moves[first] + moves[second] - distance[first, second]
+                    if missing > 1e-9:
+                        raise ValueError(
+                            f"{names[first]} and {names[second]} do not fit: {missing:.3f} of room is missing between "
+                            f"them; use smaller bodies, wider spacing, or less noise"
+                        )
+
+    def sample(self, rngs: Sequence[Generator]) -> FloatArray:
+        """Return one layout per generator.
+
+        Args:
+            rngs: One generator per copy; used only if there is noise.
+
+        Returns:
+            (len(rngs), K, 2) positions.
+        """
+        position = np.tile(self.position, (len(rngs), 1, 1))
+        if self.noise > 0.0:
+            for e, rng in enumerate(rngs):
+                position[e, : self.num_noisy] += rng.uniform(-self.noise, self.noise, (self.num_noisy, 2))
+        return position

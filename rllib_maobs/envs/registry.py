@@ -3,14 +3,24 @@
 from typing import Any
 
 from rllib_maobs.envs.options import closest
+from rllib_maobs.envs.predator_prey import PredatorPrey
 from rllib_maobs.envs.scenario import Scenario
+from rllib_maobs.envs.simple_tunnel import SimpleTunnel
 from rllib_maobs.envs.spread import Spread
+from rllib_maobs.envs.tunnel import Tunnel
 from rllib_maobs.envs.vector import VectorEnv
 
 SCENARIOS: dict[str, tuple[type[Scenario[Any]], dict[str, Any]]] = {
+    "obstacle-predator-prey": (PredatorPrey, {}),
     "spread-3a": (Spread, {"num_agents": 3, "num_obstacles": 2}),
     "spread-6a": (Spread, {"num_agents": 6, "num_obstacles": 4}),
     "spread-9a": (Spread, {"num_agents": 9, "num_obstacles": 6}),
+    "tunnel": (Tunnel, {}),
+    "simple-tunnel": (SimpleTunnel, {}),
+    "simple-tunnel-6a": (
+        SimpleTunnel,
+        {"num_agents": 6, "num_columns": 2, "start_distance": 0.95, "target_distance": 0.95},
+    ),
 }
 """Class and preset options of each scenario id."""
 
@@ -43,9 +53,7 @@ def make_scenario(scenario: str | type[Scenario[Any]], **options: Any) -> Scenar
         return scenario(**options)
     if scenario not in SCENARIOS:
         legal = list(SCENARIOS)
-        raise ValueError(
-            f"unknown scenario {scenario!r}{closest(str(scenario), legal)}; legal ids: {', '.join(legal)}"
-        )
+        raise ValueError(f"unknown scenario {scenario!r}{closest(str(scenario), legal)}; legal ids: {', '.join(legal)}")
     cls, preset = SCENARIOS[scenario]
     return cls(**{**preset, **options})
 

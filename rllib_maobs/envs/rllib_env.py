@@ -10,6 +10,7 @@ from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from ray.rllib.utils.annotations import override
 
 from rllib_maobs.envs.registry import make_scenario
+from rllib_maobs.envs.rendering import Frame
 from rllib_maobs.envs.single import ByAgent, SingleCopy
 from rllib_maobs.envs.vector import VectorEnv
 
@@ -31,7 +32,8 @@ class MAObsEnv(MultiAgentEnv):
     ```
 
     Args:
-        config: "scenario" (a registered id or a `Scenario` class) and the scenario's options.
+        config: "scenario" (a registered id or a `Scenario` class), the scenario's options, and "render_mode":
+            None, "rgb_array" (`render()` returns a picture (H, W, 3)) or "human" (a window shows every step).
 
     Raises:
         ValueError: If the scenario or an option is unknown, or a value is illegal; names what is legal.
@@ -41,8 +43,9 @@ class MAObsEnv(MultiAgentEnv):
         options = dict(config)
         if "scenario" not in options:
             raise ValueError('the env config needs a "scenario", such as {"scenario": "spread-9a"}')
+        self.render_mode = options.pop("render_mode", None)
         self.scenario = make_scenario(options.pop("scenario"), **options)
-        self._copy = SingleCopy(self.scenario)
+        self._copy = SingleCopy(self.scenario, self.render_mode)
         self.possible_agents = list(self.scenario.agents)
         self.agents = list(self.scenario.agents)
         super().__init__()
@@ -50,9 +53,7 @@ class MAObsEnv(MultiAgentEnv):
         self.action_spaces = self._copy.env.action_spaces
 
     @override(MultiAgentEnv)
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[ByAgent, ByAgent]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByAgent, ByAgent]:
         """Begin an episode.
 
         Args:
@@ -83,6 +84,20 @@ class MAObsEnv(MultiAgentEnv):
             dict.fromkeys(everybody, truncated),
             infos,
         )
+
+    @override(MultiAgentEnv)
+    def render(self) -> Frame | None:
+        """Return a picture, or None in mode "human"; see `SingleCopy.render`."""
+        return self._copy.render()
+
+    @override(MultiAgentEnv)
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._copy.close()
+
+    def heuristic(self) -> ByAgent:
+        """Return the actions of the scenario's hand-written policy by agent; see `Scenario.heuristic`."""
+        return self._copy.heuristic()
 
     def state(self, kind: str | None = None) -> NDArray[np.float32]:
         """Return the (S,) global state; see `VectorEnv.state`."""

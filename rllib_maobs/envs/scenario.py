@@ -65,44 +65,74 @@ class Scenario(ABC, Generic[OptionsT]):
     A scenario holds options, never episode state: it describes E copies at once, and all its arrays have E
     first.
 
-    Example: reach the origin, alone.
+    Example: meet at the origin without touching each other.
 
     ```python
+    from dataclasses import dataclass
+
+    import numpy as np
+
+    import rllib_maobs as maobs
+    from rllib_maobs.envs import Bodies, Outcome, ScenarioOptions
+
+
     @dataclass(frozen=True)
     class HomeOptions(ScenarioOptions):
-        num_agents: Annotated[int, Range(1)] = 2
+        num_agents: int = 2
+        penalty: float = 1.0
 
-    class Home(Scenario[HomeOptions]):
+
+    class Home(maobs.Scenario[HomeOptions]):
         options_class = HomeOptions
-        metrics = {"distance": "mean"}
+        metrics = {"distance": "mean"}  # the mean over the steps of an episode
 
         def bodies(self):
-            return [Bodies("agent", self.options.num_agents, radius=0.1, movable=True, accel=5.0)]
+            return [Bodies("agent", self.options.num_agents, radius=0.1, movable=True, accel=5.0, max_speed=1.0)]
 
-        def place(self, rngs):
+        def place(self, rngs):  # one generator per copy: (E, K, 2)
             return np.stack([rng.uniform(-1, 1, (self.options.num_agents, 2)) for rng in rngs])
 
         @property
         def observation_size(self):
             return 4
 
-        def observe(self, world, out):
+        def observe(self, world, out):  # out: (E, N, 4)
             out[..., 0:2] = world.velocity
             out[..., 2:4] = world.position
 
         def outcome(self, world):
             distance = np.linalg.norm(world.position, axis=-1)  # (E, N)
-            return Outcome(-distance, (distance < 0.1).all(-1), {"distance": distance.mean(-1)})
+            rewards = -distance - self.options.penalty * world.contacts("agent")
+            return Outcome(rewards, (distance < 0.3).all(axis=1), {"distance": distance.mean(axis=1)})
 
-    register_scenario("home", Home)
-    env = make_vec("home", num_envs=8, num_agents=4)
+        def heuristic(self, world):  # optional: forces in [-1, 1]
+            return np.clip(-2.0 * world.position - world.velocity, -1.0, 1.0)
+
+
+    env = maobs.make_vec(Home, num_envs=8, num_agents=4)  # or parallel_env(Home), or MAObsEnv({"scenario": Home})
+    observations, _ = env.reset(seed=0)
+    observations, rewards, terminated, truncated, info = env.step(env.heuristic())
+
+    config = (
+        maobs.MADDPGLConfig()
+        .environment(maobs.MAObsEnv, env_config={"scenario": Home, "num_agents": 3})
+        .training(updates_per_env_step=0.1)
+    )
+    algo = config.build_algo()
+    results = algo.train()
+    print(results["env_runners"]["episode_metrics"]["distance"])
+    algo.stop()
     ```
+
+    An id of its own, such as "home", comes from `register_scenario("home", Home)`. Type hints like
+    `Annotated[int, Range(1)]` in the options make illegal values an error.
 
     Attributes:
         options_class: The frozen dataclass of the options.
         metrics: How each metric of `outcome` becomes one number per episode: "last" (value at the end),
             "mean", "sum", "min" or "max" over the steps, "first" (first step at which it is true, the horizon
-            if it never is).
+            if it never is). An entry for one of `EpisodeTracker`'s own names replaces how that one is reduced.
+        own_targets: Whether target i belongs to agent i, for pictures.
         options: The options of this instance.
         agents: Ids of the N agents.
 
@@ -112,12 +142,14 @@ class Scenario(ABC, Generic[OptionsT]):
     """
 
     options_class: ClassVar[type[ScenarioOptions]] = ScenarioOptions
+    own_targets: ClassVar[bool] = False
     metrics: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, **options: Any) -> None:
         owner = type(self).__name__
         self.options: OptionsT = build_options(self.options_class, options, owner)  # type: ignore[assignment]
-        self.agents = [f"agent_{i}" for i in range(self.bodies()[0].count)]
+        acting = self.agent_groups()
+        self.agents = [f"{g.name}_{i}" for g in self.bodies() if g.name in acting for i in range(g.count)]
 
     def __repr__(self) -> str:
         options = ", ".join(f"{name}={value!r}" for name, value in asdict(self.options).items())
@@ -125,7 +157,17 @@ class Scenario(ABC, Generic[OptionsT]):
 
     @abstractmethod
     def bodies(self) -> Sequence[Bodies]:
-        """Return the groups of bodies, in the order agents, scripted bodies, obstacles, targets."""
+        """Return the groups of bodies, in the order agents, scripted bodies, obstacles, targets.
+
+        Metrics and pictures know the groups "obstacle" and "target" by these names.
+        """
+
+    def agent_groups(self) -> Sequence[str]:
+        """Return the names of the groups that act: the first ones of `bodies`; by default the first alone.
+
+        The first group is the team whose collisions, paths and clearance the metrics are about.
+        """
+        return [self.bodies()[0].name]
 
     @abstractmethod
     def place(self, rngs: Sequence[Generator]) -> FloatArray:
@@ -141,7 +183,12 @@ class Scenario(ABC, Generic[OptionsT]):
     @property
     @abstractmethod
     def observation_size(self) -> int:
-        """O, the length of one agent's observation."""
+        """O, the length of one agent's observation; of the longest one where they differ."""
+
+    @property
+    def observation_sizes(self) -> Sequence[int]:
+        """Length of each agent's observation; shorter ones are padded with zeros to O in arrays (E, N, O)."""
+        return [self.observation_size] * len(self.agents)
 
     @abstractmethod
     def observe(self, world: World, out: NDArray[np.float32]) -> None:
@@ -149,12 +196,36 @@ class Scenario(ABC, Generic[OptionsT]):
 
         Args:
             world: The copies.
-            out: (E, N, O), to be filled.
+            out: (E, N, O), to be filled with each agent's `observation_sizes` numbers; the rest is padding.
         """
 
     @abstractmethod
     def outcome(self, world: World) -> Outcome:
         """Return rewards, success and metrics of the situation after a step."""
+
+    def heuristic(self, world: World) -> FloatArray:
+        """Return what a hand-written policy would do: a baseline, and a proof that the task can be solved.
+
+        It sees the whole world. Played by `VectorEnv.heuristic`.
+
+        Args:
+            world: The copies.
+
+        Returns:
+            (E, N, 2) directed force in units of a body's `accel`, each component in [-1, 1].
+
+        Raises:
+            NotImplementedError: If the scenario has none.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no heuristic policy: override Scenario.heuristic")
+
+    def view(self) -> tuple[float, float]:
+        """Return half the width and height of what pictures show, around the origin."""
+        return 1.5, 1.5
+
+    def metric_reductions(self) -> Mapping[str, str]:
+        """Return `metrics`; override it where the names depend on options."""
+        return self.metrics
 
     def walls(self) -> Sequence[Wall]:
         """Return the walls of the arena; none by default."""
@@ -193,6 +264,28 @@ class Scenario(ABC, Generic[OptionsT]):
             return _DIRECTIONS[actions]
         clipped = np.clip(actions, -1.0, 1.0, dtype=np.float64)
         return clipped if self.options.action_mode == "force" else clipped[..., 1::2] - clipped[..., 2::2]
+
+    def actions(self, control: FloatArray) -> NDArray[Any]:
+        """Turn directed force into actions, the inverse of `control`.
+
+        Args:
+            control: (E, N, 2), components in [-1, 1].
+
+        Returns:
+            (E, N, A) float32; (E, N) integers for discrete actions: the direction of the larger component, or
+            idle where none is above one half.
+        """
+        mode = self.options.action_mode
+        if mode == "force":
+            return control.astype(np.float32)
+        if mode == "mpe":
+            actions = np.zeros((*control.shape[:-1], 5), np.float32)
+            actions[..., 1::2] = np.maximum(control, 0.0)
+            actions[..., 2::2] = np.maximum(-control, 0.0)
+            return actions
+        axis = np.abs(control).argmax(axis=-1)
+        strongest = np.take_along_axis(control, axis[..., None], axis=-1)[..., 0]
+        return np.where(np.abs(strongest) > 0.5, 1 + 2 * axis + (strongest < 0.0), 0)
 
     def scripted_control(self, world: World, rngs: Sequence[Generator]) -> FloatArray:
         """Return (E, M - N, 2), the control of the movable bodies that are not agents.

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rllib_maobs.envs.rendering import FRAMES_PER_SECOND, Frame, Renderer, check_render_mode
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.envs.vector import VectorEnv
 
@@ -17,29 +18,46 @@ class SingleCopy:
 
     Args:
         scenario: The task.
+        render_mode: None, "rgb_array" or "human".
+
+    Raises:
+        ValueError: If the mode is unknown.
+        ImportError: If pictures cannot be drawn.
     """
 
-    def __init__(self, scenario: Scenario[Any]) -> None:
+    def __init__(self, scenario: Scenario[Any], render_mode: str | None = None) -> None:
+        check_render_mode(render_mode)
         self.env = VectorEnv(scenario, num_envs=1)
+        self.render_mode = render_mode
+        self._renderer = None if render_mode is None else Renderer(scenario, self.env.world)
+        self._sizes = list(scenario.observation_sizes)
 
     def reset(self, seed: int | None) -> tuple[ByAgent, ByAgent]:
         """Begin an episode; returns observations and infos by agent."""
         observations, _ = self.env.reset(seed)
+        if self._renderer is not None:
+            self._renderer.begin()
+            self._show()
         return self._by_agent(observations[0]), {agent: {} for agent in self.env.agents}
 
     def step(self, actions: Mapping[str, Any]) -> tuple[ByAgent, ByAgent, bool, bool, ByAgent]:
         """Step; returns observations and rewards by agent, terminated, truncated, infos by agent.
 
         Raises:
-            ValueError: If an agent has no action, or an action comes from an unknown agent.
+            RuntimeError: If there was no reset, or the episode has ended.
+            ValueError: If an agent has no action, an action comes from an unknown agent, or one has a wrong shape.
         """
+        self.env.check_running()
         agents = self.env.agents
         if set(actions) != set(agents):
             missing = [agent for agent in agents if agent not in actions]
             unknown = [agent for agent in actions if agent not in agents]
             raise ValueError(f"actions must come from {agents}; missing: {missing}, unknown: {unknown}")
-        joint = np.stack([np.asarray(actions[agent]) for agent in agents])[None]
+        joint = np.stack([self._check_shape(agent, np.asarray(actions[agent])) for agent in agents])[None]
         observations, rewards, terminated, truncated, info = self.env.step(joint)
+        if self._renderer is not None:
+            self._renderer.note_step()
+            self._show()
         metrics = {name: float(value[0]) for name, value in info.get("episode_metrics", {}).items()}
         infos: ByAgent = {agent: {"episode_metrics": dict(metrics)} if metrics else {} for agent in agents}
         rewards_by_agent = {agent: float(reward) for agent, reward in zip(agents, rewards[0], strict=True)}
@@ -51,9 +69,43 @@ class SingleCopy:
             infos,
         )
 
+    def render(self) -> Frame | None:
+        """Return the picture of the present situation, (H, W, 3), in mode "rgb_array"; None in mode "human".
+
+        Raises:
+            RuntimeError: If the environment was made without a render mode.
+        """
+        if self._renderer is None:
+            raise RuntimeError('render() needs an environment made with render_mode="rgb_array" or "human"')
+        if self.render_mode == "rgb_array":
+            return self._renderer.frame()
+        self._show()
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def _show(self) -> None:
+        """In mode "human", bring the window up to date."""
+        if self._renderer is not None and self.render_mode == "human":
+            self._renderer.show(FRAMES_PER_SECOND)
+
+    def heuristic(self) -> ByAgent:
+        """Return the actions of the scenario's hand-written policy by agent."""
+        return dict(zip(self.env.agents, self.env.heuristic()[0], strict=True))
+
     def state(self, kind: str | None = None) -> NDArray[np.float32]:
         """Return the (S,) global state."""
         return self.env.state(kind)[0]
 
     def _by_agent(self, rows: NDArray[np.float32]) -> ByAgent:
-        return dict(zip(self.env.agents, rows, strict=True))
+        rows_and_sizes = zip(self.env.agents, rows, self._sizes, strict=True)
+        return {agent: row[:size] for agent, row, size in rows_and_sizes}
+
+    def _check_shape(self, agent: str, action: NDArray[Any]) -> NDArray[Any]:
+        expected = self.env.action_spaces[agent].shape
+        if action.shape != expected:
+            raise ValueError(f"action of {agent} has shape {action.shape}; expected {expected}")
+        return action

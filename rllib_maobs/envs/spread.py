@@ -1,42 +1,31 @@
 """Spread: cover all targets, touch nobody."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive
 from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.placement import Placement
-from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
+from rllib_maobs.envs.steering import assign, steer, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
-
-Positive = Range(0.0, exclusive=True)
 
 
 @dataclass(frozen=True)
-class SpreadOptions(ScenarioOptions):
+class SpreadOptions(CoverageOptions):
     """Options of `Spread`, documented there."""
 
-    num_agents: Annotated[int, Range(1)] = 3
     num_obstacles: Annotated[int, Range(0)] = 2
-    agent_radius: Annotated[float, Positive] = 0.15
-    obstacle_radius: Annotated[float, Positive] = 0.1
-    goal_radius: Annotated[float, Positive] = 0.1
-    reward_mode: Literal["sum", "mean", "individual"] = "sum"
-    agent_collision_penalty: Annotated[float, Range(0.0)] = 1.0
-    obstacle_collision_penalty: Annotated[float, Range(0.0)] = 1.0
     placement: Literal["separated", "mpe"] = "separated"
     clearance: Annotated[float, Range(0.0)] = 0.02
     agent_range: Annotated[float, Positive] = 1.0
     obstacle_range: Annotated[float, Positive] = 0.9
-    accel: Annotated[float, Positive] = 5.0
-    max_speed: Annotated[float, Positive] | None = 1.0
 
 
-class Spread(Scenario[SpreadOptions]):
+class Spread(Coverage[SpreadOptions]):
     """N agents share N targets among M obstacles: stay on all targets at once and collide with nothing.
 
     Ids `spread-3a`, `spread-6a`, `spread-9a`: N agents with M = 2, 4, 6 obstacles.
@@ -60,6 +49,12 @@ class Spread(Scenario[SpreadOptions]):
     agent within `goal_radius`, at the end), `coverage_mean` (mean over the steps), `all_covered` and
     `all_covered_mean` (1 where all are covered), `target_distance` (mean over the steps of the sum over
     targets of the distance to the nearest agent). Success means that all targets are covered.
+
+    **Reference returns** of one agent, mean over 200 episodes (seeds 0 to 199) of `spread-3a` / `spread-6a` /
+    `spread-9a`: uniformly random actions -802 / -2197 / -4052. The heuristic (a potential field and an assignment of
+    agents to targets) -34 / -82 / -137; it covers all targets in 99 / 96 / 96 % of the episodes, and 98 / 78 / 50 %
+    are without any contact. It sees only what is near: where two obstacles, or an agent that has arrived, close the
+    straight way, it may stay in the pocket between them.
 
     Args:
         num_agents: N agents and as many targets. [paper: 3, 6, 9]
@@ -93,90 +88,35 @@ class Spread(Scenario[SpreadOptions]):
     """
 
     options_class = SpreadOptions
-    metrics: ClassVar[Mapping[str, str]] = {
-        "coverage": "last",
-        "coverage_mean": "mean",
-        "all_covered": "last",
-        "all_covered_mean": "mean",
-        "target_distance": "mean",
-    }
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         o, n, m = self.options, self.options.num_agents, self.options.num_obstacles
         agents, obstacles, targets = range(n), range(n, n + m), range(n + m, 2 * n + m)
         self._placement = Placement(
-            names=[f"{group.name}_{i}" for group in self.bodies() for i in range(group.count)],
+            names=self._names,
             half_width=[o.agent_range] * n + [o.obstacle_range] * m + [o.agent_range] * n,
             room=[o.agent_radius] * n + [o.obstacle_radius] * m + [o.agent_radius] * n,
             clearance=o.clearance,
             exclusive=[[*agents, *obstacles], [*obstacles, *targets]] if o.placement == "separated" else [],
         )
-        # The other agents of each agent, in the N * K pairs of an agent and a body.
-        num_bodies = 2 * n + m
-        self._others = np.array([i * num_bodies + j for i in agents for j in agents if j != i], np.intp)
 
     def bodies(self) -> Sequence[Bodies]:
         """Return agents, obstacles, targets."""
-        o = self.options
-        return [
-            Bodies("agent", o.num_agents, o.agent_radius, movable=True, accel=o.accel, max_speed=o.max_speed),
-            Bodies("obstacle", o.num_obstacles, o.obstacle_radius),
-            Bodies("target", o.num_agents, 0.05, collides=False),
-        ]
+        return self._make_bodies(self.options.num_obstacles)
 
     def place(self, rngs: Sequence[Generator]) -> FloatArray:
         """Return random positions, see `placement`."""
         return self._placement.sample(rngs)
 
-    @property
-    def observation_size(self) -> int:
-        """O."""
-        n, m = self.options.num_agents, self.options.num_obstacles
-        return 4 + 2 * n + 2 * m + 2 * (n - 1)
+    def view(self) -> tuple[float, float]:
+        """Return what pictures show: where everything starts, and half a unit around it."""
+        half = max(self.options.agent_range, self.options.obstacle_range) + 0.5
+        return half, half
 
-    def observe(self, world: World, out: NDArray[np.float32]) -> None:
-        """Write velocity, position, targets, obstacles, other agents."""
-        n, m = self.options.num_agents, self.options.num_obstacles
-        e = world.num_envs
-        relative = world.offset.reshape(e, n, -1)  # (E, N, 2K)
-        others = world.offset.reshape(e, -1, 2).take(self._others, axis=1)  # (E, N(N - 1), 2)
-        out[..., 0:2] = world.velocity[:, :n]
-        out[..., 2:4] = world.position[:, :n]
-        out[..., 4 : 4 + 2 * n] = relative[..., 2 * (n + m) :]
-        out[..., 4 + 2 * n : 4 + 2 * n + 2 * m] = relative[..., 2 * n : 2 * (n + m)]
-        out[..., 4 + 2 * n + 2 * m :] = others.reshape(e, n, -1)
-
-    def outcome(self, world: World) -> Outcome:
-        """Return the reward of the class docstring and how well the targets are covered."""
-        o = self.options
-        nearest = world.distance[:, :, world.index["target"]].min(axis=1)  # (E, N)
-        total = nearest.sum(axis=1)
-        rewards = -total[:, None] - o.agent_collision_penalty * world.contacts("agent")
-        rewards -= o.obstacle_collision_penalty * world.contacts("obstacle")
-        covered = nearest < o.goal_radius
-        coverage, all_covered = covered.mean(axis=1), covered.all(axis=1)
-        metrics = {
-            "coverage": coverage,
-            "coverage_mean": coverage,
-            "all_covered": all_covered,
-            "all_covered_mean": all_covered,
-            "target_distance": total,
-        }
-        return Outcome(share_rewards(rewards, o.reward_mode), all_covered, metrics)
-
-
-def share_rewards(rewards: FloatArray, mode: Literal["sum", "mean", "individual"]) -> FloatArray:
-    """Give every agent the sum or the mean of all agents' rewards, or its own.
-
-    Args:
-        rewards: (E, N) own rewards.
-        mode: "sum", "mean" or "individual".
-
-    Returns:
-        (E, N).
-    """
-    if mode == "individual":
-        return rewards
-    shared = rewards.sum(axis=1, keepdims=True) if mode == "sum" else rewards.mean(axis=1, keepdims=True)
-    return np.broadcast_to(shared, rewards.shape)
+    def heuristic(self, world: World) -> FloatArray:
+        """Steer every agent to a target of its own, around everything else."""
+        targets = world.index["target"]
+        goal = assign(world.distance[..., targets])
+        aim = world.offset[:, :, targets][np.arange(world.num_envs)[:, None], np.arange(goal.shape[1]), goal]
+        return thrust(world, steer(world, aim))

@@ -57,8 +57,11 @@ class VectorEnv:
         self.num_envs = num_envs
         self.agents = list(scenario.agents)
         self.horizon: int = scenario.options.horizon
-        n, o = len(self.agents), scenario.observation_size
-        spaces = {agent: gym.spaces.Box(-np.inf, np.inf, (o,), np.float32) for agent in self.agents}
+        n, sizes = len(self.agents), list(scenario.observation_sizes)
+        spaces = {a: gym.spaces.Box(-np.inf, np.inf, (o,), np.float32) for a, o in zip(self.agents, sizes, strict=True)}
+        # (N, O), where an observation ends and its padding begins; None where no agent has any.
+        padding = np.arange(scenario.observation_size) >= np.array(sizes)[:, None]
+        self._padding: NDArray[np.bool_] | None = padding if padding.any() else None
         self.observation_spaces: dict[str, gym.Space[Any]] = dict(spaces)
         self.action_spaces = {agent: scenario.action_space() for agent in self.agents}
         action_shape: tuple[int, ...] = scenario.action_space().shape or ()
@@ -117,12 +120,14 @@ class VectorEnv:
             ValueError: If actions have a wrong shape, are not finite or are out of range; names agent and
                 copy.
         """
+        self.check_running()
         actions = np.asarray(actions)
-        self._check_step(actions)
+        self._check_actions(actions)
         world, scenario = self.world, self.scenario
         control = scenario.control(actions)
         if world.num_movers > len(self.agents):
             assert self._rngs is not None
+            world.refresh()
             control = np.concatenate([control, scenario.scripted_control(world, self._rngs)], axis=1)
         self._tracker.before_step(world)
         world.step(control * self._accel)
@@ -140,28 +145,47 @@ class VectorEnv:
         return self.observe(), outcome.rewards.astype(np.float32), terminated, truncated, info
 
     def observe(self) -> NDArray[np.float32]:
-        """Return the (E, N, O) observations of the current situation, also after a write to the world."""
+        """Return the (E, N, O) observations of the current situation, also after a write to the world.
+
+        Where the agents' observations differ in length, O is that of the longest and the others end in zeros;
+        `observation_spaces` tells the true lengths.
+        """
         self.world.refresh()
         out = np.empty((self.num_envs, len(self.agents), self.scenario.observation_size), np.float32)
         self.scenario.observe(self.world, out)
+        if self._padding is not None:
+            out[:, self._padding] = 0.0
         return out
+
+    def heuristic(self) -> NDArray[Any]:
+        """Return the actions of the scenario's hand-written policy in the current situation.
+
+        Returns:
+            (E, N, A); (E, N) integers for discrete actions.
+
+        Raises:
+            NotImplementedError: If the scenario has none.
+        """
+        self.world.refresh()
+        return self.scenario.actions(self.scenario.heuristic(self.world))
 
     def state(self, kind: str | None = None) -> NDArray[np.float32]:
         """Return the (E, S) global state of the current situation.
 
         Args:
-            kind: "observations" (all agents' observations in a row) or "world" (positions of all bodies, then
-                velocities of those that move); None for the scenario's option `state`.
+            kind: "observations" (all agents' observations in a row, without padding) or "world" (positions of all
+                bodies, then velocities of those that move); None for the scenario's option `state`.
         """
         if self._state_kind(kind) == "world":
             return self.scenario.world_state(self.world)
-        return self.observe().reshape(self.num_envs, -1)
+        observations = self.observe()
+        return observations.reshape(self.num_envs, -1) if self._padding is None else observations[:, ~self._padding]
 
     def state_size(self, kind: str | None = None) -> int:
         """Return S of a kind of state; see `state`."""
         if self._state_kind(kind) == "world":
             return self.scenario.world_state_size()
-        return len(self.agents) * self.scenario.observation_size
+        return sum(self.scenario.observation_sizes)
 
     def close(self) -> None:
         """Free nothing: here because every environment has it."""
@@ -178,9 +202,7 @@ class VectorEnv:
             return np.ones(self.num_envs, bool)
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ValueError(
-                f"mask is {mask.dtype} of shape {mask.shape}; expected bool of shape ({self.num_envs},)"
-            )
+            raise ValueError(f"mask is {mask.dtype} of shape {mask.shape}; expected bool of shape ({self.num_envs},)")
         return mask
 
     def _seed(self, seed: int | Sequence[int] | None, copies: NDArray[np.intp]) -> None:
@@ -196,27 +218,29 @@ class VectorEnv:
         else:
             seeds = np.asarray(seed, np.int64)
         if seeds.shape != (self.num_envs,) or (seeds < 0).any():
-            raise ValueError(
-                f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None"
-            )
+            raise ValueError(f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None")
         self.seeds[copies] = seeds[copies]
         for e in copies.tolist():
             self._rngs[e] = np.random.default_rng(self.seeds[e])
 
-    def _check_step(self, actions: NDArray[Any]) -> None:
-        if self._finished.any():
-            copies = np.flatnonzero(self._finished).tolist()
-            if (self._steps[copies] == 0).all():
-                raise RuntimeError(f"step() before reset(): copies {copies} were never reset")
-            raise RuntimeError(
-                f"step() after the end of the episode of copies {copies}: "
-                f"call reset(mask=terminated | truncated) first"
-            )
+    def check_running(self) -> None:
+        """Raise a RuntimeError if a copy cannot be stepped: it was never reset, or its episode has ended."""
+        if not self._finished.any():
+            return
+        copies = np.flatnonzero(self._finished).tolist()
+        single = self.num_envs == 1
+        if (self._steps[copies] == 0).all():
+            raise RuntimeError("step() before reset()" + ("" if single else f": copies {copies} were never reset"))
+        if single:
+            raise RuntimeError("step() after the end of the episode: call reset() first")
+        raise RuntimeError(
+            f"step() after the end of the episode of copies {copies}: call reset(mask=terminated | truncated) first"
+        )
+
+    def _check_actions(self, actions: NDArray[Any]) -> None:
         if actions.shape != self._actions_shape:
             letters = "(E, N)" if self._discrete else "(E, N, A)"
-            raise ValueError(
-                f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}"
-            )
+            raise ValueError(f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}")
         if self._discrete:
             if not np.issubdtype(actions.dtype, np.integer):
                 raise ValueError(f"discrete actions are {actions.dtype}; expected integers")
@@ -228,6 +252,4 @@ class VectorEnv:
         """Raise for the first bad action, if any; bad is (E, N)."""
         if bad.any():
             copy, agent = np.argwhere(bad)[0]
-            raise ValueError(
-                f"action of {self.agents[agent]} in copy {copy} is {reason}: {actions[copy, agent]}"
-            )
+            raise ValueError(f"action of {self.agents[agent]} in copy {copy} is {reason}: {actions[copy, agent]}")

@@ -29,6 +29,7 @@ class Bodies:
         collides: Whether it touches other colliding bodies; targets do not.
         accel: Force at full action, for bodies that act.
         max_speed: Speed limit, None for no limit.
+        limit: Half width of the square around the origin in which its centre is held, None for no limit.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Bodies:
     collides: bool = True
     accel: float = 1.0
     max_speed: float | None = None
+    limit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,7 @@ class World:
     ) -> None:
         movable = [group.movable for group in groups]
         if movable != sorted(movable, reverse=True):
-            raise ValueError(
-                f"movable groups come first; got {[g.name for g in groups]} with movable={movable}"
-            )
+            raise ValueError(f"movable groups come first; got {[g.name for g in groups]} with movable={movable}")
         self.num_envs = num_envs
         self.groups = tuple(groups)
         self.walls = tuple(walls)
@@ -138,6 +138,9 @@ class World:
         caps = [np.inf if g.max_speed is None else g.max_speed for g in groups if g.movable]
         self._max_speed = np.repeat(caps, [g.count for g in groups if g.movable])
         self._capped = bool(np.isfinite(self._max_speed).any())
+        limits = [np.inf if g.limit is None else g.limit for g in groups if g.movable]
+        self._limit = np.repeat(limits, [g.count for g in groups if g.movable])[:, None]
+        self._limited = bool(np.isfinite(self._limit).any())
         self._group_of = np.repeat(np.arange(len(groups)), counts)
         collides = np.repeat([g.collides for g in groups], counts)
         num_colliders = int(np.flatnonzero(collides).max(initial=-1)) + 1
@@ -234,6 +237,8 @@ class World:
                 position += velocity * dt
             if self.walls:
                 self._stop_at_walls(position, velocity)
+            if self._limited:
+                self._stop_at_limits(position, velocity)
             self._measure()
 
     def _measure(self) -> None:
@@ -291,3 +296,10 @@ class World:
                 position -= np.maximum(beyond, 0.0)[..., None] * normal
                 outward = velocity[..., 0] * normal[0] + velocity[..., 1] * normal[1]
                 velocity -= np.where(beyond > 0.0, np.maximum(outward, 0.0), 0.0)[..., None] * normal
+
+    def _stop_at_limits(self, position: FloatArray, velocity: FloatArray) -> None:
+        """Keep the centres of bodies with a limit in their square, and take the outward velocity at its edge."""
+        beyond = np.abs(position) > self._limit
+        if beyond.any():
+            np.clip(position, -self._limit, self._limit, out=position)
+            velocity[beyond & (velocity * position > 0.0)] = 0.0

@@ -5,14 +5,13 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 PAPER_HORIZON = 100
 _FILE = "experiment.json"
 _BEFORE_START = (_FILE, "tuner.pkl")  # What is written before the first trial starts.
 # What --quick changes; a flag that is given still wins.
 QUICK = {"seeds": [0], "stop_timesteps": 4000, "no_compile": True, "checkpoint_freq": 2}
-
-
 # What decides the results: a resumed run must have the same.
 SETTINGS = (
     "algos",
@@ -27,25 +26,31 @@ SETTINGS = (
 )
 
 
-def save_settings(args: argparse.Namespace) -> None:
-    """Write what a resumed run must know into the results folder."""
-    settings = {name: getattr(args, name) for name in SETTINGS}
-    (args.results_dir / _FILE).write_text(json.dumps(settings, indent=2) + "\n")
+def save_settings(name: str, args: argparse.Namespace) -> None:
+    """Write what a resumed run must know into the results folder.
+
+    Args:
+        name: Of the experiment.
+        args: From `parse`.
+    """
+    settings = {setting: getattr(args, setting) for setting in SETTINGS}
+    (args.results_dir / _FILE).write_text(json.dumps({"experiment": name, **settings}, indent=2) + "\n")
 
 
-def _at_least(minimum: int) -> Callable[[str], int]:
-    """Return an argparse type: whole numbers from a minimum, also written 2e6 or 2_000_000."""
+def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
+    """Return an argparse type: whole numbers in a range, also written 2e6 or 2_000_000."""
 
-    def whole_number(text: str) -> int:
+    def parse_number(text: str) -> int:
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value) or value != int(value) or value < minimum:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {minimum}")
+        if not math.isfinite(value) or value != int(value) or not low <= value <= high:
+            bound = f" and <= {high:.0f}" if math.isfinite(high) else ""
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number >= {low}{bound}")
         return int(value)
 
-    return whole_number
+    return parse_number
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -55,7 +60,9 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
         return action.help if not action.default else super()._get_help_string(action)
 
 
-def make_parser(name: str, algos: Sequence[str], stop_timesteps: int, doc: str | None = None) -> argparse.ArgumentParser:
+def make_parser(
+    name: str, algos: Sequence[str], stop_timesteps: int, doc: str | None = None
+) -> argparse.ArgumentParser:
     """Build the command line.
 
     Args:
@@ -68,11 +75,11 @@ def make_parser(name: str, algos: Sequence[str], stop_timesteps: int, doc: str |
         The parser.
     """
     quick = f"{QUICK['stop_timesteps']} env steps, seed 0, no compiling; flags that are given still count"
-    positive, natural = _at_least(1), _at_least(0)
+    positive, natural, seed = _whole_number(1), _whole_number(0), _whole_number(0, 2**32 - 1)
     parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
     what = parser.add_argument_group("what to train")
     what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
-    what.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2], help="one trial per algorithm and seed")
+    what.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2], help="one trial per algorithm and seed")
     what.add_argument("--stop-timesteps", type=positive, default=stop_timesteps, help="env steps of every trial")
     what.add_argument(
         "--train-horizon",
@@ -96,7 +103,11 @@ def make_parser(name: str, algos: Sequence[str], stop_timesteps: int, doc: str |
         default=0,
         help="EnvRunner actors per trial, one core each; with 0 the trial's own process samples",
     )
-    how.add_argument("--address", help="Ray cluster to run on (auto: the one on this machine) instead of starting one")
+    how.add_argument(
+        "--address",
+        help="Ray cluster to run on (auto: the one that this machine is in) instead of starting one here; all its "
+        "machines must have this package, and see --results-dir under the same path",
+    )
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
     how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard on http://127.0.0.1:8265")
 
@@ -140,12 +151,16 @@ def parse(parser: argparse.ArgumentParser, name: str, argv: Sequence[str] | None
         parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
 
     results_dir = (args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)).resolve()
-    started = results_dir.is_dir() and any(path.name not in _BEFORE_START for path in results_dir.iterdir())
+    if results_dir.exists() and not results_dir.is_dir():
+        parser.error(f"--results-dir: {results_dir} is not a folder")
     if args.resume:
-        if not started or not (results_dir / _FILE).is_file():
+        if not has_started(results_dir) or not (results_dir / _FILE).is_file():
             parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
-        args = _with_stored_settings(parser, argv, results_dir / _FILE)
-    elif started:
+        stored = json.loads((results_dir / _FILE).read_text())
+        if (other := stored.pop("experiment")) != name:
+            parser.error(f"{results_dir} holds a run of {other}, not of {name}: correct --results-dir")
+        args = _with_stored_settings(parser, argv, stored)
+    elif has_started(results_dir):
         parser.error(
             f"{results_dir} is not empty: continue the run there with --resume, or choose another --results-dir"
         )
@@ -153,18 +168,22 @@ def parse(parser: argparse.ArgumentParser, name: str, argv: Sequence[str] | None
     return args
 
 
+def has_started(results_dir: Path) -> bool:
+    """Return whether a folder holds more than what is written before the first trial starts."""
+    return results_dir.is_dir() and any(path.name not in _BEFORE_START for path in results_dir.iterdir())
+
+
 def _with_stored_settings(
-    parser: argparse.ArgumentParser, argv: Sequence[str] | None, path: Path
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None, stored: dict[str, Any]
 ) -> argparse.Namespace:
     """Parse again with the settings of the original run as defaults, and refuse flags that contradict them."""
-    stored = json.loads(path.read_text())
     parser.set_defaults(**stored)
     args = parser.parse_args(argv)
     for name, value in stored.items():
         if getattr(args, name) != value:
             flag = f"--{name.replace('_', '-')}"
             parser.error(
-                f"{flag}: the run in {path.parent} has {value}, and --resume continues it as it is: leave {flag} out, "
-                f"or start a new run in another --results-dir"
+                f"{flag}: the original run has {value}, and --resume continues it as it is: leave {flag} out, or "
+                f"start a new run in another --results-dir"
             )
     return args

@@ -8,9 +8,9 @@ from typing import Any
 
 from ray.tune import ProgressReporter
 
-from rllib_maobs.experiment.report import LABELS, SCORE, evaluation_metrics, format_table
+from rllib_maobs.experiment.report import LABELS, SCORE, STEPS, evaluation_metrics, format_metric
+from rllib_maobs.experiment.tables import format_table, format_time
 
-STEPS = "num_env_steps_sampled_lifetime"
 _STATUS = {"RUNNING": "running", "TERMINATED": "done", "ERROR": "failed"}
 
 
@@ -20,14 +20,6 @@ def makespan(seconds: Iterable[float], workers: int) -> float:
     for duration in seconds:
         heapq.heapreplace(free_at, free_at[0] + duration)
     return max(free_at)
-
-
-def format_time(seconds: float | None) -> str:
-    """Write a duration as hours, minutes and seconds; "-" if it is not known."""
-    if seconds is None:
-        return "-"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 class ProgressTable(ProgressReporter):
@@ -56,6 +48,8 @@ class ProgressTable(ProgressReporter):
         for trial in trials:
             if trial.status == "RUNNING" and trial.last_result.get(STEPS):
                 self._from.setdefault(trial.trial_id, (trial.last_result[STEPS], trial.last_result["time_total_s"]))
+        if all(trial.status == "PENDING" for trial in trials):
+            return False
         return done or time.monotonic() - self._reported >= self._every_s
 
     def report(self, trials: list[Any], done: bool, *sys_info: str) -> None:
@@ -73,14 +67,15 @@ class ProgressTable(ProgressReporter):
             A line with the time elapsed and left, and one line per trial.
         """
         metrics = [evaluation_metrics(trial.last_result) for trial in trials]
-        headline = "coverage" if any("coverage" in row for row in metrics) else "success"
+        known_metrics = set[str]().union(*metrics)
+        headline = "success" if "success" in known_metrics and "coverage" not in known_metrics else "coverage"
         shown = [SCORE, headline, "collisions"]
         speeds = [self._speed(trial) for trial in trials]
         known = [speed for speed in speeds if speed]
         rows, remaining = [], []
         for trial, values, speed in zip(trials, metrics, speeds, strict=True):
             status = _STATUS.get(trial.status, "waiting")
-            steps = trial.last_result.get(STEPS, 0)
+            steps = int(trial.last_result.get(STEPS, 0))
             left = None
             if status in ("running", "waiting") and known:
                 left = max(self._stop_timesteps - steps, 0) / (speed or sum(known) / len(known))
@@ -90,7 +85,7 @@ class ProgressTable(ProgressReporter):
                     str(trial),
                     status,
                     f"{steps:,} / {self._stop_timesteps:,}",
-                    *(f"{values[name]:.2f}" if name in values else "-" for name in shown),
+                    *(format_metric(name, values[name]) if name in values else "-" for name in shown),
                     f"{speed:.0f}" if speed else "-",
                     format_time(left if status == "running" else None),
                 ]

@@ -8,12 +8,14 @@ Everything here reads the files that Ray Tune writes, so a notebook can use it o
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+
+from rllib_maobs.experiment.tables import format_table, format_time
 
 FILES = ("comparison.md", "comparison.csv", "curves.csv", "curves.png")
 SCORE = "score"
@@ -27,7 +29,9 @@ LABELS = {
     "collisions": "collisions / episode",
     "collision_free": "collision-free",
 }
-_KEYS = ["trial", "algorithm", "seed", "env_steps"]
+# Evaluations at the end of a trial whose mean is its result.
+LAST = 10
+STEPS = "num_env_steps_sampled_lifetime"
 
 
 def evaluation_metrics(result: Mapping[str, Any]) -> dict[str, float]:
@@ -64,43 +68,59 @@ def load_curves(results_dir: str | Path) -> pd.DataFrame:
     Raises:
         FileNotFoundError: If no trial has reported anything there.
     """
-    frames = [pd.DataFrame(list(_rows(path))) for path in sorted(Path(results_dir).glob("*/result.json"))]
-    frames = [frame for frame in frames if len(frame)]
-    if not frames:
+    trials = {path.parent.name: _read_results(path) for path in sorted(Path(results_dir).glob("*/result.json"))}
+    rows = []
+    for trial, results in trials.items():
+        before = 0
+        for result in results:
+            steps = int(result[STEPS])
+            rows.append(
+                {
+                    "trial": trial,
+                    "algorithm": result["config"]["algorithm"],
+                    "seed": int(result["config"]["seed"]),
+                    "env_steps": steps,
+                    **evaluation_metrics(result),
+                    "time_total_s": float(result["time_total_s"]),
+                    "env_steps_per_s": (steps - before) / max(float(result["time_this_iter_s"]), 1e-9),
+                }
+            )
+            before = steps
+    if not rows:
         raise FileNotFoundError(f"No trial has reported a result in {results_dir}")
-    curves = pd.concat(frames, ignore_index=True)
-    first = [*_KEYS, *(name for name in LABELS if name in curves)]
+    curves = pd.DataFrame(rows)
+    first = ["trial", "algorithm", "seed", "env_steps", *(name for name in LABELS if name in curves)]
     return curves[[*first, *(name for name in curves if name not in first)]]
 
 
-def _rows(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one trial's result.json: one JSON object per line."""
-    rows: list[dict[str, Any]] = []
+def _read_results(path: Path) -> list[dict[str, Any]]:
+    """Read one trial's result.json: one JSON object per line."""
+    results: list[dict[str, Any]] = []
     for line in path.read_text().splitlines():
         try:
             result = json.loads(line)
         except json.JSONDecodeError:
             continue  # The last line of a run that was killed while writing it.
-        steps = int(result["num_env_steps_sampled_lifetime"])
         # A resumed trial goes back to its last checkpoint; what it had reported after that is void.
-        while rows and rows[-1]["env_steps"] >= steps:
-            rows.pop()
-        steps_before = rows[-1]["env_steps"] if rows else 0
-        rows.append(
-            {
-                "trial": path.parent.name,
-                "algorithm": result["config"]["algorithm"],
-                "seed": int(result["config"]["seed"]),
-                "env_steps": steps,
-                **evaluation_metrics(result),
-                "time_total_s": float(result["time_total_s"]),
-                "env_steps_per_s": (steps - steps_before) / max(float(result["time_this_iter_s"]), 1e-9),
-            }
-        )
-    yield from rows
+        while results and results[-1][STEPS] >= result[STEPS]:
+            results.pop()
+        results.append(result)
+    return results
 
 
-def summarise(curves: pd.DataFrame, last: int = 10) -> pd.DataFrame:
+def _rewrite_progress_csv(path: Path) -> None:
+    """Write one trial's progress.csv anew from its result.json.
+
+    Tune fixes the columns of progress.csv with the first result. What comes later is left out, such as the metrics of
+    training episodes that end in a later iteration, and after a resume the columns no longer fit their names.
+    """
+    table = pd.json_normalize(
+        [{key: value for key, value in result.items() if key != "config"} for result in _read_results(path)], sep="/"
+    )
+    table.to_csv(path.with_name("progress.csv"), index=False)
+
+
+def summarise(curves: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
     """Compare the algorithms by their last evaluations.
 
     Args:
@@ -113,6 +133,8 @@ def summarise(curves: pd.DataFrame, last: int = 10) -> pd.DataFrame:
         single one), `env_steps_per_s` and `hours` (per trial, means over the seeds).
     """
     measures = [name for name in LABELS if name in curves]
+    if "all_covered" in measures:
+        measures.remove("success")  # It is the same there.
     by_trial = curves.groupby(["algorithm", "trial"], sort=False)
     trials = by_trial[measures].agg(lambda column: column.tail(last).mean())
     end = by_trial[["env_steps", "time_total_s"]].last()
@@ -139,43 +161,21 @@ def to_markdown(table: pd.DataFrame) -> str:
     Returns:
         A markdown table, aligned to be read as plain text too.
     """
-    header = ["algorithm", "seeds", "env steps"]
-    header += [LABELS[name] for name in LABELS if name in table] + ["env steps/s", "hours"]
+    measures = [name for name in LABELS if name in table]
+    header = ["algorithm", "seeds", "env steps", *(LABELS[name] for name in measures), "env steps/s", "time"]
     rows = []
     for algorithm, row in table.iterrows():
         cells = [str(algorithm), f"{row['seeds']:.0f}", f"{row['env_steps']:,.0f}"]
-        for name in LABELS:
-            if name == SCORE and name in table:
-                spread = "" if np.isnan(row["score_std"]) else f" ± {row['score_std']:.1f}"
-                cells.append(f"{row[name]:.1f}{spread}")
-            elif name in table:
-                cells.append(f"{row[name]:.2f}")
-        rows.append([*cells, f"{row['env_steps_per_s']:.0f}", f"{row['hours']:.2f}"])
+        cells += [format_metric(name, row[name]) for name in measures]
+        if SCORE in measures and row["seeds"] > 1:
+            cells[3 + measures.index(SCORE)] += f" ± {row['score_std']:.1f}"
+        rows.append([*cells, f"{row['env_steps_per_s']:.0f}", format_time(3600 * row["hours"])])
     return format_table(header, rows, markdown=True)
 
 
-def format_table(header: list[str], rows: list[list[str]], *, markdown: bool = False) -> str:
-    """Align cells: the first column to the left, the numbers to the right.
-
-    Args:
-        header: Names of the columns.
-        rows: Their cells.
-        markdown: Whether to draw the lines of a markdown table.
-
-    Returns:
-        The table, without a newline at the end.
-    """
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-
-    def line(cells: list[str]) -> str:
-        padded = [cells[0].ljust(widths[0])]
-        padded += [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
-        return f"| {' | '.join(padded)} |" if markdown else "  ".join(padded).rstrip()
-
-    lines = [line(header), *map(line, rows)]
-    if markdown:
-        lines.insert(1, line(["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]))
-    return "\n".join(lines)
+def format_metric(name: str, value: float) -> str:
+    """Write a metric with as many decimals as say something."""
+    return f"{value:.1f}" if name in (SCORE, "collisions", "captures") else f"{value:.2f}"
 
 
 def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points: int = 200) -> None:
@@ -215,24 +215,33 @@ def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points:
     figure.savefig(path, dpi=150)
 
 
-def write_report(results_dir: Path, title: str) -> str:
-    """Write the `FILES` into the results folder.
+def write_report(results_dir: Path, title: str, failed: Collection[str] = ()) -> str:
+    """Write the `FILES` into the results folder, and complete the trials' progress.csv.
 
     Args:
         results_dir: The folder that the experiment wrote to.
         title: Heading of the picture and of the table.
+        failed: Trials that are left out of the comparison; their curves are drawn as far as they got.
 
     Returns:
-        The comparison table as markdown.
+        The comparison table as markdown, and what its numbers are.
 
     Raises:
         FileNotFoundError: If no trial has reported anything there.
     """
     curves = load_curves(results_dir)
-    table = summarise(curves)
-    markdown = to_markdown(table)
+    for path in results_dir.glob("*/result.json"):
+        _rewrite_progress_csv(path)
     curves.to_csv(results_dir / "curves.csv", index=False)
     plot_curves(curves, results_dir / "curves.png", title)
+    table = summarise(curves[~curves["trial"].isin(list(failed))])
     table.to_csv(results_dir / "comparison.csv")
+    note = (
+        f"Noise-free evaluation: means over the last {LAST} evaluations of each trial, then over the seeds (score: ± "
+        f"their standard deviation). Time is h:mm:ss per trial."
+    )
+    if failed:
+        note += f" Failed and left out: {', '.join(failed)}."
+    markdown = f"{to_markdown(table)}\n\n{note}"
     (results_dir / "comparison.md").write_text(f"# {title}\n\n{markdown}\n")
     return markdown

@@ -1,8 +1,10 @@
 """An experiment as one command: algorithms x seeds as trials of Ray Tune, with a report at the end."""
 
+import json
 import logging
 import os
 import shlex
+import shutil
 import sys
 import time
 from argparse import Namespace
@@ -15,24 +17,26 @@ import ray
 from ray import tune
 
 import rllib_maobs as maobs
-from rllib_maobs.experiment.arguments import PAPER_HORIZON, make_parser, parse, save_settings
-from rllib_maobs.experiment.progress import STEPS, ProgressTable, format_time, makespan
-from rllib_maobs.experiment.report import FILES, format_table, write_report
-from rllib_maobs.experiment.trial import Trial, TrialSpec, measure_env_steps_per_s
+from rllib_maobs.experiment.arguments import PAPER_HORIZON, has_started, make_parser, parse, save_settings
+from rllib_maobs.experiment.progress import ProgressTable, makespan
+from rllib_maobs.experiment.report import FILES, STEPS, write_report
+from rllib_maobs.experiment.tables import format_table, format_time
+from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
 
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """Compares algorithms on one environment; `main()` is the whole program.
 
+        experiment = Experiment(
+            name="spread-9a",
+            env="maobs/spread-9a",
+            algorithms=("iddpg", "maddpg", "maddpg-l"),
+            training={"actor_lr": 1e-3, "critic_lr": 1e-2, "train_batch_size_per_learner": 32},
+            stop_timesteps=2_000_000,
+        )
         if __name__ == "__main__":
-            Experiment(
-                name="spread-9a",
-                env="maobs/spread-9a",
-                algorithms=("iddpg", "maddpg", "maddpg-l"),
-                training={"actor_lr": 1e-3, "critic_lr": 1e-2, "train_batch_size_per_learner": 32},
-                stop_timesteps=2_000_000,
-            ).main()
+            experiment.main()
 
     Every algorithm is trained with every seed. A trial evaluates its actors without exploration noise every 1000 env
     steps: 10 episodes of 100 steps on environments of its own. Its score is the paper's, the undiscounted return of
@@ -55,6 +59,10 @@ class Experiment:
     env_config: Mapping[str, Any] = field(default_factory=dict)
     stop_timesteps: int = 2_000_000
 
+    def __post_init__(self) -> None:
+        if unknown := set(self.algorithms) - set(maobs.ALGORITHMS):
+            raise ValueError(f"Unknown algorithms {sorted(unknown)}; legal are {', '.join(maobs.ALGORITHMS)}.")
+
     def main(self, argv: Sequence[str] | None = None) -> None:
         """Run the command line.
 
@@ -66,6 +74,7 @@ class Experiment:
         """
         parser = make_parser(self.name, self.algorithms, self.stop_timesteps, f"Train on {self.env}.")
         args = parse(parser, self.name, argv)
+        _quiet()
         specs = self.specs(args)
         try:
             for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
@@ -74,8 +83,8 @@ class Experiment:
             parser.error(str(error))
         try:
             code = self._run(args, specs)
-        except KeyboardInterrupt:  # While trials run, Tune takes it: it saves its state and returns.
-            print("\nInterrupted before the first trial.")
+        except KeyboardInterrupt:  # While trials run, Tune takes the first one: it saves its state and returns.
+            print("\nInterrupted.", f"Go on with: {_resume_command(args)}" if has_started(args.results_dir) else "")
             code = 130
         if code:
             sys.exit(code)
@@ -92,7 +101,7 @@ class Experiment:
                 evaluation_env_config={"horizon": PAPER_HORIZON},
                 num_env_runners=args.num_env_runners,
                 torch_compile=not args.no_compile,
-                steps_per_iteration=500 if args.quick else 1000,
+                steps_per_iteration=400 if args.quick else 1000,
                 evaluation_duration=5 if args.quick else 10,
             )
             for seed in args.seeds
@@ -101,63 +110,61 @@ class Experiment:
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
         """Measure, train, report; return the exit code."""
-        # Tune's own tables are long and its warnings about frequent snapshots do not concern a run of a few trials.
-        os.environ["RAY_AIR_NEW_OUTPUT"] = "0"
-        os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
-        quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-        if args.address:
-            ray.init(address=args.address, **quiet)
-        else:
-            cores = args.workers * (1 + args.num_env_runners)
-            ray.init(num_cpus=cores, include_dashboard=args.dashboard, **quiet)
-        logging.getLogger("ray").setLevel(logging.ERROR)
+        _start_ray(args)
         try:
             maobs.register()
+            args.results_dir.mkdir(parents=True, exist_ok=True)
             if args.resume:
                 print(f"Resuming {self.name} in {args.results_dir}", flush=True)
+                _forget_decisions(args.results_dir)
                 tuner = tune.Tuner.restore(str(args.results_dir), trainable=Trial, resume_errored=True)
             else:
                 self._print_plan(args, specs)
-                tuner = _make_tuner(args, specs)
+                tuner = _make_tuner(self.name, args, specs)
             trials = tuner.fit()
         finally:
             ray.shutdown()
         return self._report(args, trials, len(specs))
 
     def _print_plan(self, args: Namespace, specs: list[TrialSpec]) -> None:
-        """Say what will be run, how long it will take and where it will be found."""
-        ratio = specs[0].build_config().updates_per_env_step
+        """Say what will be run, what it will take and where it will be found."""
+        config = specs[0].build_config()
         print(
-            f"{self.name}: {len(specs)} trials (algorithm x seed: {', '.join(args.algos)} x "
-            f"{', '.join(map(str, args.seeds))}), {args.stop_timesteps:,} env steps each, {ratio:g} updates per env step\n"
-            f"Measuring how fast they run here{'' if args.no_compile else ' (compiling first)'} ...",
+            f"{self.name}: {len(specs)} trials, {', '.join(args.algos)} with seed {', '.join(map(str, args.seeds))}\n"
+            f"{args.stop_timesteps:,} env steps each, {config.updates_per_env_step:g} update(s) per env step\n"
+            f"Measuring how fast that is here{'' if args.no_compile else ' (and compiling)'} ...",
             flush=True,
         )
-        at_once = min(int(ray.cluster_resources()["CPU"]) // (1 + args.num_env_runners), len(specs))
         start = time.monotonic()
+        cores = int(ray.available_resources().get("CPU", 0))
+        at_once = max(1, min(cores // (1 + args.num_env_runners), len(specs)))
         pace = _measure(specs[: len(args.algos)], at_once, seconds=2.0 if args.quick else 10.0)
-        hours = {name: args.stop_timesteps / speed / 3600 for name, speed in pace.items()}
-        rows = [[name, f"{pace[name]:.0f}", f"{hours[name]:.2f}"] for name in args.algos]
-        total = makespan([hours[spec.algorithm] for spec in specs], at_once)
+        seconds = {name: args.stop_timesteps / pace[name].env_steps_per_s for name in args.algos}
+        rows = [[name, f"{pace[name].env_steps_per_s:.0f}", format_time(seconds[name])] for name in args.algos]
+        total = makespan([seconds[spec.algorithm] for spec in specs], at_once)
+        kept = min(args.stop_timesteps, config.replay_buffer_capacity)
+        megabytes = kept * max(each.bytes_per_env_step for each in pace.values()) / 1e6
         print(
-            f"{format_table(['algorithm', 'env steps/s', 'hours per trial'], rows)}\n"
-            f"Measured in {format_time(time.monotonic() - start)} with {at_once} at once; evaluation is included, "
-            f"compiling is not.\n"
-            f"Estimated time for all: {total:.2f} hours, {at_once} trials at once.\n"
+            f"\n{format_table(['algorithm', 'env steps/s', 'time per trial'], rows)}\n\n"
+            f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
+            f"compiling.\n"
+            f"Estimated: {total / 3600:.2f} hours for all, {at_once} at once.\n"
+            f"Replay will take {megabytes:,.0f} MB of memory per trial, and as much of disk in its checkpoint; free "
+            f"disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB.\n"
             f"Results: {args.results_dir}\n"
             f"TensorBoard: tensorboard --logdir {shlex.quote(str(args.results_dir))}\n"
-            f"Ctrl-C stops; the same command with --resume goes on from the last checkpoints.",
+            f"Ctrl-C stops; then --resume goes on from the last checkpoints.\n",
             flush=True,
         )
 
     def _report(self, args: Namespace, trials: tune.ResultGrid, planned: int) -> int:
         """Write and print the results; return the exit code."""
+        failed = [Path(trial.path) for trial in trials if trial.error]
         try:
-            print(f"\n{write_report(args.results_dir, self.name)}\n")
+            print(f"\n{write_report(args.results_dir, self.name, [path.name for path in failed])}\n")
             print(f"In {args.results_dir}: {', '.join(FILES)}")
         except FileNotFoundError as error:
             print(error)
-        failed = [Path(trial.path) for trial in trials if trial.error]
         for path in failed:
             print(f"FAILED: {path.name}, see {path / 'error.txt'}")
         finished = sum((trial.metrics or {}).get(STEPS, 0) >= args.stop_timesteps for trial in trials)
@@ -170,9 +177,35 @@ class Experiment:
         return 0
 
 
-def _make_tuner(args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:
-    args.results_dir.mkdir(parents=True, exist_ok=True)
-    save_settings(args)
+def _quiet() -> None:
+    """Keep Ray's own tables and notes away from the progress table; errors still show."""
+    for name in ("ray", "ray.rllib"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    # Tune leaves the table to our reporter only in its older form of output.
+    os.environ["RAY_AIR_NEW_OUTPUT"] = "0"
+    # It warns that a run with frequent checkpoints saves its state often, which takes no time with a few trials.
+    os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
+
+
+def _start_ray(args: Namespace) -> None:
+    """Start Ray on this machine with one CPU per process of a trial, or connect to a cluster."""
+    if args.address:
+        try:
+            ray.init(address=args.address, log_to_driver=False, logging_level=logging.ERROR)
+        except ConnectionError as error:
+            sys.exit(f"error: --address {args.address}: {error}")
+        return
+    ray.init(
+        address="local",
+        num_cpus=args.workers * (1 + args.num_env_runners),
+        include_dashboard=args.dashboard,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+    )
+
+
+def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:
+    save_settings(name, args)
     return tune.Tuner(
         Trial,
         param_space=tune.grid_search([asdict(spec) for spec in specs]),
@@ -185,25 +218,38 @@ def _make_tuner(args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:
                 checkpoint_frequency=args.checkpoint_freq, checkpoint_at_end=True, num_to_keep=1
             ),
             progress_reporter=ProgressTable(args.stop_timesteps, every_s=10.0 if args.quick else 30.0),
-            log_to_file=True,
             verbose=1,
         ),
     )
+
+
+def _forget_decisions(results_dir: Path) -> None:
+    """Take out of Tune's saved state what it still meant to do with trials when it ended.
+
+    For a trial that dies while it writes a checkpoint, Tune notes that it is to be stopped after the checkpoint. The
+    note outlives the run: resumed, the trial would be stopped after its next checkpoint, as if it had finished.
+    """
+    for path in results_dir.glob("experiment_state-*.json"):
+        state = json.loads(path.read_text())
+        state["runner_data"]["_cached_trial_decisions"] = {}
+        changed = path.with_suffix(".new")
+        changed.write_text(json.dumps(state, indent=2))
+        changed.replace(path)
 
 
 def _trial_name(trial: Any) -> str:
     return f"{trial.config['algorithm']}-seed{trial.config['seed']}"
 
 
-def _measure(specs: Sequence[TrialSpec], at_once: int, seconds: float) -> dict[str, float]:
-    """Return env steps per second by algorithm, measured with so many at once as there will be trials."""
-    remote = ray.remote(num_cpus=1, max_calls=1)(measure_env_steps_per_s)
-    pace: dict[str, float] = {}
-    waiting, running = list(specs), {}
+def _measure(specs: Sequence[TrialSpec], at_once: int, seconds: float) -> dict[str, Pace]:
+    """Measure the pace of each algorithm with so many at once as there will be trials."""
+    measure = ray.remote(num_cpus=1)(measure_pace)
+    pace: dict[str, Pace] = {}
+    waiting, running = list(specs), dict[Any, str]()
     while waiting or running:
         while waiting and len(running) < at_once:
             spec = waiting.pop(0)
-            running[remote.remote(spec, seconds)] = spec.algorithm
+            running[measure.remote(spec, seconds)] = spec.algorithm
         (done,), _ = ray.wait(list(running))
         pace[running.pop(done)] = ray.get(done)
     return pace

@@ -4,7 +4,7 @@ import contextlib
 import os
 import time
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from ray import tune
@@ -120,15 +120,22 @@ class Trial(tune.Trainable):
         self._algorithm.stop()
 
 
-def measure_env_steps_per_s(spec: TrialSpec, seconds: float) -> float:
-    """Train for a moment to see how fast a trial will run on this machine.
+class Pace(NamedTuple):
+    """What a trial takes: env steps per second, evaluation included, and bytes of replay per env step."""
+
+    env_steps_per_s: float
+    bytes_per_env_step: float
+
+
+def measure_pace(spec: TrialSpec, seconds: float) -> Pace:
+    """Train for a moment to see what a trial will take on this machine.
 
     Args:
         spec: The trial. Compiling it fills the on-disk cache from which the trial itself will be compiled.
         seconds: How long to measure, once learning has started and everything is compiled.
 
     Returns:
-        Env steps per second, evaluation included.
+        What was measured.
     """
     # Short iterations without evaluation, which is timed alone: a few seconds are enough for both.
     config = spec.build_config().evaluation(evaluation_interval=10**9)
@@ -147,7 +154,7 @@ def measure_env_steps_per_s(spec: TrialSpec, seconds: float) -> float:
     algorithm.evaluate()
     per_step += (time.perf_counter() - start) / spec.steps_per_iteration
     algorithm.stop()
-    return float(1.0 / per_step)
+    return Pace(1.0 / per_step, algorithm.replay_buffer.nbytes / algorithm.replay_buffer.capacity)
 
 
 def _build(config: AlgorithmConfig) -> Any:

@@ -1,23 +1,28 @@
 """Environment steps per second of the simulator beside MPE2, at the same number of agents, on one core.
 
-Run: `OMP_NUM_THREADS=1 python tests/benchmarks/env_speed.py [--scenario spread-9a] [--seconds 2]`
+Run: `OMP_NUM_THREADS=1 python tests/benchmarks/env_speed.py [--scenario spread-9a] [--seconds 2] [--profile]`
 
 All copies count: 64 copies stepped once are 64 environment steps. Observations, rewards, metrics and resets are
-included. The two simulators take turns, so that a change in the load of the machine meets both; the best round counts.
+included. The candidates take turns, so that a change in the load of the machine meets all of them; the best round
+counts. Below the table: what an agent costs in a team three times as large, in a room of the same density, and with
+`--profile` where the time of 64 copies goes.
 """
 
 import argparse
+import cProfile
+import pstats
 import time
 from collections.abc import Callable
 
 import numpy as np
 from mpe2 import simple_spread_v3
 
-from rllib_maobs.envs import VectorEnv, make_vec
+from rllib_maobs.envs import MAObsParallelEnv, VectorEnv, make_vec, parallel_env
 
 HORIZON = 100
 COPIES = (1, 8, 64)
 ROUNDS = 4
+Row = tuple[int, Callable[[], float]]
 
 
 def vector_episode(env: VectorEnv, actions: np.ndarray) -> float:
@@ -27,6 +32,16 @@ def vector_episode(env: VectorEnv, actions: np.ndarray) -> float:
     seconds = time.perf_counter() - start
     for step in actions:
         env.step(np.broadcast_to(step, (env.num_envs, *step.shape)))
+    return seconds
+
+
+def parallel_episode(env: MAObsParallelEnv, actions: np.ndarray) -> float:
+    """Play one episode through the PettingZoo face; returns the seconds spent in the reset."""
+    start = time.perf_counter()
+    env.reset()
+    seconds = time.perf_counter() - start
+    for step in actions:
+        env.step(dict(zip(env.agents, step, strict=True)))
     return seconds
 
 
@@ -51,32 +66,77 @@ def measure(episode: Callable[[], float], copies: int, seconds: float) -> tuple[
     return episodes * HORIZON * copies / total, resets / total
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="spread-9a")
-    parser.add_argument("--seconds", type=float, default=2.0, help="per row, over all rounds")
-    args = parser.parse_args()
-
-    n = len(make_vec(args.scenario).agents)
-    actions = np.random.default_rng(0).uniform(0, 1, (HORIZON, n, 5)).astype(np.float32)
-    theirs = simple_spread_v3.parallel_env(N=n, max_cycles=HORIZON, continuous_actions=True)
-    rows: dict[str, tuple[int, Callable[[], float]]] = {"mpe2": (1, lambda: mpe2_episode(theirs, actions))}
-    for copies in COPIES:
-        env = make_vec(args.scenario, num_envs=copies)
-        env.reset(seed=0)
-        rows[f"{copies} copies"] = (copies, lambda env=env: vector_episode(env, actions))  # type: ignore[misc]
-
+def take_turns(rows: dict[str, Row], seconds: float) -> dict[str, tuple[float, float]]:
+    """Return the best round of each row: steps per second and the share of resets."""
     best = dict.fromkeys(rows, (0.0, 0.0))
     for _ in range(ROUNDS):
         for name, (copies, episode) in rows.items():
-            best[name] = max(best[name], measure(episode, copies, args.seconds / ROUNDS))
+            best[name] = max(best[name], measure(episode, copies, seconds / ROUNDS))
+    return best
 
-    print(f"{args.scenario} ({n} agents) beside mpe2 simple_spread (N={n}), episodes of {HORIZON} steps")
-    print(f"{'':>10} {'env steps/s':>12} {'x mpe2':>8} {'us per env step':>16} {'in resets':>10}")
+
+def vector_row(copies: int, actions: np.ndarray, scenario: str, **options: object) -> Row:
+    """Return a row that plays E copies."""
+    env = make_vec(scenario, num_envs=copies, **options)
+    env.reset(seed=0)
+    return copies, lambda: vector_episode(env, actions)
+
+
+def compare_with_mpe2(scenario: str, seconds: float) -> None:
+    """Print steps per second beside MPE2."""
+    ours = parallel_env(scenario)
+    n = len(ours.possible_agents)
+    actions = np.random.default_rng(0).uniform(0, 1, (HORIZON, n, 5)).astype(np.float32)
+    theirs = simple_spread_v3.parallel_env(N=n, max_cycles=HORIZON, continuous_actions=True)
+    rows: dict[str, Row] = {
+        "mpe2": (1, lambda: mpe2_episode(theirs, actions)),
+        "PettingZoo face": (1, lambda: parallel_episode(ours, actions)),
+        **{f"{copies} copies": vector_row(copies, actions, scenario) for copies in COPIES},
+    }
+    best = take_turns(rows, seconds)
+    print(f"{scenario} ({n} agents) beside mpe2 simple_spread (N={n}), episodes of {HORIZON} steps")
+    print(f"{'':>16} {'env steps/s':>12} {'x mpe2':>8} {'us per env step':>16} {'in resets':>10}")
     for name, (speed, resets) in best.items():
         ratio = speed / best["mpe2"][0]
-        print(f"{name:>10} {speed:12,.0f} {ratio:8.1f} {1e6 / speed:16.2f} {resets:10.1%}")
+        print(f"{name:>16} {speed:12,.0f} {ratio:8.1f} {1e6 / speed:16.2f} {resets:10.1%}")
+
+
+def compare_team_sizes(seconds: float) -> None:
+    """Print what an agent costs among 9 and among 27, with as much room for each."""
+    rows = {}
+    for n, factor in ((9, 1.0), (27, 3.0**0.5)):
+        actions = np.random.default_rng(0).uniform(0, 1, (HORIZON, n, 5)).astype(np.float32)
+        room = {"agent_range": factor, "obstacle_range": 0.9 * factor}
+        rows[f"{n} agents"] = vector_row(64, actions, "spread-9a", num_agents=n, num_obstacles=2 * n // 3, **room)
+    best = take_turns(rows, seconds)
+    cost = {name: 1e6 / speed / int(name.split()[0]) for name, (speed, _) in best.items()}
+    print("\nSpread, 64 copies, obstacles and room in proportion: time of one agent in one step")
+    for name, microseconds in cost.items():
+        print(f"{name:>16} {microseconds:8.2f} us, {best[name][1]:6.1%} in resets")
+    print(f"{'ratio':>16} {cost['27 agents'] / cost['9 agents']:8.2f}")
+
+
+def profile(scenario: str) -> None:
+    """Print where the time of 64 copies goes."""
+    actions = np.random.default_rng(0).uniform(0, 1, (HORIZON, len(make_vec(scenario).agents), 5))
+    _, episode = vector_row(64, actions, scenario)
+    with cProfile.Profile() as profiler:
+        for _ in range(5):
+            episode()
+    pstats.Stats(profiler).sort_stats("tottime").print_stats(14)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="spread-9a")
+    parser.add_argument("--seconds", type=float, default=2.0, help="per row, over all rounds")
+    parser.add_argument("--profile", action="store_true")
+    args = parser.parse_args()
+    compare_with_mpe2(args.scenario, args.seconds)
+    compare_team_sizes(args.seconds)
+    if args.profile:
+        profile(args.scenario)
 
 
 if __name__ == "__main__":

@@ -24,15 +24,18 @@ ENV = {
 }
 
 
-def mpe_spread_config(algorithm: str, seed: int) -> maobs.JointConfig:
-    """An algorithm on plain MPE spread."""
+STEPS = 400_000
+
+
+def mpe_spread_config(algorithm: str, seed: int, steps: int = STEPS) -> maobs.JointConfig:
+    """An algorithm on plain MPE spread, for a run of so many env steps."""
     config = maobs.ALGORITHMS[algorithm]()
     config.environment("maobs/spread-3a", env_config=ENV)
     config.env_runners(num_envs_per_env_runner=20)
     config.training(
-        # Constant until half of the run; without the decay D keeps moving between 0.86 and 0.96 at the end.
-        actor_lr=[[0, 5e-4], [150_000, 5e-4], [300_000, 2e-5]],
-        critic_lr=[[0, 1e-3], [150_000, 1e-3], [300_000, 5e-5]],
+        # Constant for half of the run; without the decay D keeps moving between 0.86 and 0.96 at the end.
+        actor_lr=[[0, 5e-4], [steps // 2, 5e-4], [steps, 2e-5]],
+        critic_lr=[[0, 1e-3], [steps // 2, 1e-3], [steps, 5e-5]],
         critic_state="world",
         gamma=0.99,
         tau=0.005,
@@ -54,7 +57,7 @@ def mpe_spread_config(algorithm: str, seed: int) -> maobs.JointConfig:
 
 def train(algorithm: str, seed: int, steps: int) -> float:
     """Trains and returns the last D."""
-    algo = mpe_spread_config(algorithm, seed).build_algo()
+    algo = mpe_spread_config(algorithm, seed, steps).build_algo()
     start, distance = time.perf_counter(), float("nan")
     while True:
         result = algo.train()
@@ -72,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algo", choices=sorted(maobs.ALGORITHMS), default="maddpg", help="default: maddpg")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: 0 1 2")
-    parser.add_argument("--steps", type=int, default=300_000, help="env steps; default: 300000")
+    parser.add_argument("--steps", type=int, default=STEPS, help=f"env steps; default: {STEPS}")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)

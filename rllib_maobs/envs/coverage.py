@@ -1,0 +1,129 @@
+"""What the tasks with shared targets have in common: cover all targets, touch nobody."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rllib_maobs.envs.options import Range
+from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
+from rllib_maobs.envs.world import Bodies, FloatArray, World
+
+Positive = Range(0.0, exclusive=True)
+TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
+
+
+@dataclass(frozen=True)
+class CoverageOptions(ScenarioOptions):
+    """Options of `Coverage`, documented in its subclasses."""
+
+    num_agents: Annotated[int, Range(1)] = 3
+    agent_radius: Annotated[float, Positive] = 0.15
+    obstacle_radius: Annotated[float, Positive] = 0.1
+    goal_radius: Annotated[float, Positive] = 0.1
+    reward_mode: Literal["sum", "mean", "individual"] = "sum"
+    agent_collision_penalty: Annotated[float, Range(0.0)] = 1.0
+    obstacle_collision_penalty: Annotated[float, Range(0.0)] = 1.0
+    accel: Annotated[float, Positive] = 5.0
+    max_speed: Annotated[float, Positive] | None = 1.0
+
+
+OptionsT = TypeVar("OptionsT", bound=CoverageOptions)
+
+
+class Coverage(Scenario[OptionsT]):
+    """Base of tasks in which N agents share N targets among obstacles.
+
+    Bodies are the groups "agent", "obstacle" and "target"; subclasses say how many obstacles there are and where
+    everything starts. Observations, rewards and metrics are described in `Spread`.
+    """
+
+    options_class = CoverageOptions
+    metrics: ClassVar[Mapping[str, str]] = {
+        "coverage": "last",
+        "coverage_mean": "mean",
+        "all_covered": "last",
+        "all_covered_mean": "mean",
+        "target_distance": "mean",
+    }
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        groups = self.bodies()
+        self._names = [f"{group.name}_{i}" for group in groups for i in range(group.count)]
+        n, self._num_obstacles = groups[0].count, groups[1].count
+        self._others = others(n, len(self._names))
+
+    def _make_bodies(self, num_obstacles: int) -> list[Bodies]:
+        o = self.options
+        return [
+            Bodies("agent", o.num_agents, o.agent_radius, movable=True, accel=o.accel, max_speed=o.max_speed),
+            Bodies("obstacle", num_obstacles, o.obstacle_radius),
+            Bodies("target", o.num_agents, TARGET_RADIUS, collides=False),
+        ]
+
+    @property
+    def observation_size(self) -> int:
+        """O."""
+        n = self.options.num_agents
+        return 4 + 2 * n + 2 * self._num_obstacles + 2 * (n - 1)
+
+    def observe(self, world: World, out: NDArray[np.float32]) -> None:
+        """Write velocity, position, targets, obstacles, other agents."""
+        e, n, m = world.num_envs, self.options.num_agents, self._num_obstacles
+        relative = world.offset.reshape(e, n, -1)  # (E, N, 2K)
+        out[..., 0:2] = world.velocity[:, :n]
+        out[..., 2:4] = world.position[:, :n]
+        out[..., 4 : 4 + 2 * n] = relative[..., 2 * (n + m) :]
+        out[..., 4 + 2 * n : 4 + 2 * n + 2 * m] = relative[..., 2 * n : 2 * (n + m)]
+        out[..., 4 + 2 * n + 2 * m :] = world.offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, -1)
+
+    def outcome(self, world: World) -> Outcome:
+        """Return - sum over targets of the distance to the nearest agent - collisions, and the coverage."""
+        o = self.options
+        nearest = world.distance[:, :, world.index["target"]].min(axis=1)  # (E, N)
+        total = nearest.sum(axis=1)
+        rewards = -total[:, None] - o.agent_collision_penalty * world.contacts("agent")
+        rewards -= o.obstacle_collision_penalty * world.contacts("obstacle")
+        covered = nearest < o.goal_radius
+        coverage, all_covered = covered.mean(axis=1), covered.all(axis=1)
+        metrics = {
+            "coverage": coverage,
+            "coverage_mean": coverage,
+            "all_covered": all_covered,
+            "all_covered_mean": all_covered,
+            "target_distance": total,
+        }
+        return Outcome(share_rewards(rewards, o.reward_mode), all_covered, metrics)
+
+
+def others(num_agents: int, num_bodies: int) -> NDArray[np.intp]:
+    """Return where the other agents of each agent stand in the flattened (N, K) pairs of an agent and a body.
+
+    Args:
+        num_agents: N.
+        num_bodies: K.
+
+    Returns:
+        (N * (N - 1),) numbers, agent by agent.
+    """
+    agents = range(num_agents)
+    return np.array([i * num_bodies + j for i in agents for j in agents if j != i], np.intp)
+
+
+def share_rewards(rewards: FloatArray, mode: Literal["sum", "mean", "individual"]) -> FloatArray:
+    """Give every agent the sum or the mean of all agents' rewards, or its own.
+
+    Args:
+        rewards: (E, N) own rewards.
+        mode: "sum", "mean" or "individual".
+
+    Returns:
+        (E, N).
+    """
+    if mode == "individual":
+        return rewards
+    shared = rewards.sum(axis=1, keepdims=True) if mode == "sum" else rewards.mean(axis=1, keepdims=True)
+    return np.broadcast_to(shared, rewards.shape)

@@ -1,0 +1,139 @@
+"""The command that shows and films episodes, with every kind of policy."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+
+from rllib_maobs.envs import MAObsEnv, make_vec, parallel_env
+from rllib_maobs.play import CheckpointPolicy, main, make_policy, parse_options, play
+from tests.conftest import small_config
+
+
+def test_command_line_films(tmp_path):
+    film = tmp_path / "film.gif"
+    command = [sys.executable, "-m", "rllib_maobs.play", "tunnel", "--policy", "heuristic", "--record", str(film)]
+    done = subprocess.run([*command, "horizon=40", "start_noise=0.05"], capture_output=True, text=True, check=True)
+    assert Image.open(film).n_frames == 41
+    assert "tunnel, heuristic: mean over 1 episodes from seed 0" in done.stdout
+    assert f"written: {film}" in done.stdout
+    assert "success                       1.000" in done.stdout
+
+
+def test_metrics_are_those_of_the_episodes(capsys):
+    main(["spread-3a", "--no-window", "--policy", "heuristic", "--seed", "5", "--episodes", "3", "horizon=20"])
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines()[1:])
+    env, total = make_vec("spread-3a", num_envs=3, horizon=20), 0.0
+    env.reset(seed=5)
+    for _ in range(20):
+        _, rewards, *_, info = env.step(env.heuristic())
+        total += rewards.mean()
+    expected = {name: value.mean() for name, value in info["episode_metrics"].items()} | {"return_mean": total}
+    assert set(printed) == set(expected)
+    for name, value in expected.items():
+        assert float(printed[name]) == pytest.approx(value, abs=6e-4)
+
+
+def test_random_policy_follows_the_seed():
+    results = []
+    for seed in (0, 0, 1):
+        env = parallel_env("simple-tunnel", horizon=10)
+        results.append(play(env, make_policy(env, "random", seed), episodes=2))
+    assert results[0] == results[1] != results[2]
+
+
+def test_window_opens_without_record(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    shown = []
+    monkeypatch.setattr("rllib_maobs.envs.rendering.Renderer.show", lambda self, fps: shown.append(fps))
+    main(["tunnel", "horizon=4"])
+    assert len(shown) == 5
+
+
+def test_options_are_literals_or_words():
+    parsed = parse_options(["gap=0.3", "physics=solid", "max_speed=None", "terminate_on_success=True"])
+    assert parsed == {"gap": 0.3, "physics": "solid", "max_speed": None, "terminate_on_success": True}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["tunel"], "unknown scenario 'tunel' (did you mean 'tunnel'?)"),
+        (["tunnel", "gap"], "'gap' is no option; write NAME=VALUE"),
+        (["tunnel", "gasp=1"], "Tunnel has no option 'gasp' (did you mean 'gap'?)"),
+        (["tunnel", "--episodes", "0"], "--episodes 0 is illegal"),
+        (["tunnel", "--record", "film.avi"], "cannot record to 'film.avi'"),
+        (
+            ["tunnel", "--policy", "hueristic", "--no-window"],
+            "--policy 'hueristic' is illegal; legal: random, heuristic",
+        ),
+    ],
+)
+def test_mistakes_end_in_a_sentence(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def maddpg_checkpoint(ray_session, tmp_path_factory):
+    algo = small_config("maddpg-l").build_algo()
+    path = algo.save_to_path(str(tmp_path_factory.mktemp("maddpg")))
+    modules = {agent: algo.get_module(agent) for agent in ("agent_0", "agent_1", "agent_2")}
+    yield path, modules
+    algo.stop()
+
+
+def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
+    import torch
+
+    path, modules = maddpg_checkpoint
+    env = parallel_env("spread-3a")
+    policy = make_policy(env, path)
+    observations, _ = env.reset(seed=0)
+    actions = policy(observations)
+    for agent, module in modules.items():
+        with torch.no_grad():
+            expected = module.forward_inference({"obs": torch.from_numpy(observations[agent])[None]})["actions"][0]
+        np.testing.assert_allclose(actions[agent], expected.numpy(), rtol=1e-5, atol=1e-6)
+        assert env.action_space(agent).contains(actions[agent])
+    assert not np.allclose(actions["agent_0"], actions["agent_1"])
+    with pytest.raises(ValueError, match=r"agent_0 observes \(34,\) in Spread\(.*but was trained on \(18,\)"):
+        make_policy(parallel_env("spread-3a", num_agents=3, num_obstacles=10), path)
+    with pytest.raises(ValueError, match="has no module for agent_3; it has agent_0, agent_1, agent_2"):
+        make_policy(parallel_env("spread-3a", num_agents=4), path)
+
+
+@pytest.mark.parametrize("use_lstm", [False, True])
+@pytest.mark.parametrize("mode", ["mpe", "discrete"])
+def test_checkpoint_of_stock_ppo_with_one_policy_for_all(ray_session, tmp_path, mode, use_lstm):
+    algo = (
+        PPOConfig()
+        .environment(MAObsEnv, env_config={"scenario": "tunnel", "action_mode": mode})
+        .env_runners(num_env_runners=0)
+        .multi_agent(policies={"shared"}, policy_mapping_fn=lambda agent, episode, **kwargs: "shared")
+        .rl_module(
+            model_config=DefaultModelConfig(use_lstm=use_lstm, fcnet_hiddens=[8], lstm_cell_size=8, max_seq_len=5)
+        )
+        .build_algo()
+    )
+    path = algo.save_to_path(str(tmp_path))
+    algo.stop()
+    env = parallel_env("tunnel", action_mode=mode, horizon=5)
+    policy = make_policy(env, path)
+    assert isinstance(policy, CheckpointPolicy)
+    observations, _ = env.reset(seed=0)
+    actions = policy(observations)
+    assert all(env.action_space(agent).contains(action) for agent, action in actions.items())
+    # Without exploration, and with memory forgotten between episodes, all episodes from one seed are alike.
+    assert play(env, policy, seed=4) == play(env, policy, seed=4)
+    if use_lstm:
+        policy.reset()
+        first, second = policy._act("agent_0", observations["agent_0"]), policy._act("agent_0", observations["agent_0"])
+        if mode == "mpe":
+            assert not np.array_equal(first, second)
