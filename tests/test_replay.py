@@ -114,6 +114,14 @@ def test_old_rows_give_way_and_what_is_left_stays_true(capacity: int) -> None:
     assert len(buffer) == capacity
 
 
+def test_a_fragment_that_fills_the_ring_leaves_no_link_to_what_it_replaced() -> None:
+    buffer = JointReplayBuffer(8, N, O, A, seed=0)
+    simulator = Simulator(2, length=50)
+    for _ in range(3):
+        buffer.add(**simulator.fragment(4))
+        check(buffer.sample((100,)), 2, length=50)
+
+
 def test_a_lost_fragment_is_not_bridged() -> None:
     """A gap in a runner's steps, and a new runner in an old one's place, leave no transition across it."""
     buffer = JointReplayBuffer(1000, N, O, A, seed=0)

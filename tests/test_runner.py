@@ -116,11 +116,12 @@ def test_episodes_are_dealt_out_evenly(ray_session: None) -> None:
 
 def test_returns_are_those_of_the_agents(ray_session: None) -> None:
     runner = runner_of(small_config("maddpg", horizon=5, reward_mode="individual"))
-    s = sample(runner, num_timesteps=10)
+    s = sample(runner, num_timesteps=20)  # two episodes of each copy
     results = runner.get_metrics()
+    assert results["episode_len_mean"].peek() == 5
     for index, agent in enumerate(runner.team.agents):
         got = np.mean(results["agent_episode_returns_mean"][agent].values)
-        assert got == pytest.approx(s.rewards[:, :, index].sum(0).mean(), rel=1e-5)
+        assert got == pytest.approx(s.rewards[:, :, index].sum(0).mean() / 2, rel=1e-5)
     assert "coverage" in results["episode_metrics"]
 
 

@@ -109,7 +109,7 @@ def make_parser(
         "machines must have this package, and see --results-dir under the same path",
     )
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
-    how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard on http://127.0.0.1:8265")
+    how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard (pip install ray[default])")
 
     where = parser.add_argument_group("where results go")
     where.add_argument(

@@ -178,7 +178,7 @@ def format_metric(name: str, value: float) -> str:
     return f"{value:.1f}" if name in (SCORE, "collisions", "captures") else f"{value:.2f}"
 
 
-def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points: int = 200) -> None:
+def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points: int = 50) -> None:
     """Draw score and coverage (or success, for tasks without targets to share) against env steps.
 
     Each algorithm is a line, the mean over its seeds, in a band from its worst to its best seed.

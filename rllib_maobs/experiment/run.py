@@ -10,6 +10,7 @@ import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +196,8 @@ def _start_ray(args: Namespace) -> None:
         except ConnectionError as error:
             sys.exit(f"error: --address {args.address}: {error}")
         return
+    if args.dashboard and find_spec("aiohttp") is None:
+        sys.exit('error: --dashboard needs Ray\'s dashboard: pip install -c constraints.txt "ray[default]"')
     ray.init(
         address="local",
         num_cpus=args.workers * (1 + args.num_env_runners),
