@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import torch
@@ -82,12 +83,18 @@ class JointLearner(TorchLearner):
             )
         self.gradients: Callable[..., tuple[Tensor, Tensor, dict[str, Tensor]]] = self._gradients
         if self.config.torch_compile_learner:
+            # Code of its own: compiled code is kept per code object, and those unchecked things differ by learner.
+            own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
             self.gradients = torch.compile(
-                self._gradients,
+                MethodType(own, self),
                 fullgraph=True,
                 dynamic=False,
                 backend=self.config.torch_compile_learner_dynamo_backend,
                 mode=self.config.torch_compile_learner_dynamo_mode,
+                # Nothing but the tensors changes between calls, so nothing else need be checked at every one.
+                options=None
+                if self.config.torch_compile_learner_dynamo_mode
+                else {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
             )
 
     def act(self, actor: Params, obs: Tensor) -> Tensor:
@@ -104,7 +111,11 @@ class JointLearner(TorchLearner):
         Returns:
             `(B, N, H)`.
         """
-        return self.critics(critic, (state, 1 if state.dim() == 3 else None), method="encode")
+        if state.dim() == 3:
+            return self.critics(critic, (state, 1), method="encode")
+        # One state for all: one wide matrix product instead of N narrow ones.
+        weight = critic["from_state.weight"]  # (N, H, S)
+        return torch.nn.functional.linear(state, weight.flatten(0, 1)).unflatten(-1, weight.shape[:2])
 
     def q(self, critic: Params, encoded: Tensor, actions: Tensor) -> Tensor:
         """Every agent's Q_i.

@@ -13,6 +13,11 @@ Sample = dict[str, Tensor]
 """obs, next_obs (B, N, O); state, next_state (B, S); actions (B, N, A); rewards (B, N); terminated (B, 1)."""
 
 
+def whole_layers(critic: list[Tensor]) -> list[Tensor]:
+    """A critic of the package, parameter by parameter: it keeps the first weight in two parts, state and action."""
+    return [torch.cat(critic[:2], dim=1), *critic[2:]]
+
+
 def network(inputs: int, outputs: int, hidden: tuple[int, ...], last: nn.Module) -> nn.Sequential:
     sizes = (inputs, *hidden, outputs)
     layers: list[nn.Module] = []
@@ -56,12 +61,12 @@ class LoopLearner:
         """Takes over the parameters of the package's modules, one per agent, layer by layer."""
         for a, module in zip(self.agents, modules, strict=True):
             for own, theirs in (
-                (self.actors[a], module.actor),
-                (self.critics[a], module.critic),
-                (self.target_actors[a], module.target_actor),
-                (self.target_critics[a], module.target_critic),
+                (self.actors[a], list(module.actor.parameters())),
+                (self.critics[a], whole_layers(list(module.critic.parameters()))),
+                (self.target_actors[a], list(module.target_actor.parameters())),
+                (self.target_critics[a], whole_layers(list(module.target_critic.parameters()))),
             ):
-                for p, q in zip(own.parameters(), theirs.parameters(), strict=True):
+                for p, q in zip(own.parameters(), theirs, strict=True):
                     p.data.copy_(q.data)
 
     def critic_input(self, a: int, obs: Tensor, state: Tensor, actions: list[Tensor]) -> Tensor:

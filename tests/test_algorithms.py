@@ -190,9 +190,10 @@ def test_with_one_agent_all_algorithms_are_ddpg(ray_session: None) -> None:
         start = algo._learner.actors.flat.detach().clone()
         algo.train()
         actors.append(algo._learner.actors.flat.detach().clone())
-        assert not torch.equal(actors[-1], start)
+        assert (actors[-1] - start).abs().max() > 0.01
         algo.stop()
-    assert all(torch.equal(actor, actors[0]) for actor in actors)
+    for actor in actors:
+        torch.testing.assert_close(actor, actors[0], rtol=1e-2, atol=1e-3)
 
 
 class DiscreteAgents(TwoAgents):
@@ -250,7 +251,7 @@ def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) 
     for kind, want in widths.items():
         algo = small_config(algorithm).training(critic_state=kind).build_algo()
         critic = algo._learner.module["agent_0"].critic
-        assert (critic.state_size, critic.first.in_features - critic.state_size) == want
+        assert (critic.from_state.in_features, critic.from_action.in_features) == want
         seen: list[Batch] = []
         algo._learner.step = lambda batch, seen=seen: seen.append(batch) or {}
         algo.train()

@@ -60,9 +60,9 @@ class Critic(nn.Module):
     """Action value Q(s, u), an MLP on the concatenation of a state and an action.
 
     What "state" and "action" are is the algorithm's choice: (o_i, u_i) in IDDPG, (s, u_1..u_N) in MADDPG,
-    (s, u_i) in MADDPG-L. The first layer is applied in two parts, because its product with the state is the
-    same for Q(s, u) of the critic loss and Q(s, mu(o)) of the actor loss: the state is by far the widest
-    input, so computing `encode` once for both saves a third of the critic's work at nine agents.
+    (s, u_i) in MADDPG-L. The first layer is kept in two parts, one for each of its inputs, because its product
+    with the state is the same for Q(s, u) of the critic loss and Q(s, mu(o)) of the actor loss: the state is by
+    far the widest input, so computing `encode` once for both saves a third of the critic's work at nine agents.
 
     Args:
         state_size: S, length of the state part of the input.
@@ -79,19 +79,22 @@ class Critic(nn.Module):
         activation: str = "relu",
     ) -> None:
         super().__init__()
-        self.state_size = state_size
-        self.first = nn.Linear(state_size + action_size, hidden_sizes[0])
+        first = nn.Linear(state_size + action_size, hidden_sizes[0])  # initialised as the one layer that it is
+        self.from_state = nn.Linear(state_size, hidden_sizes[0], bias=False)
+        self.from_action = nn.Linear(action_size, hidden_sizes[0])
+        self.from_state.weight.data.copy_(first.weight[:, :state_size])
+        self.from_action.weight.data.copy_(first.weight[:, state_size:])
+        self.from_action.bias.data.copy_(first.bias)
         self.activation = ACTIVATIONS[activation]()
         self.rest = mlp((*hidden_sizes, 1), activation)
 
     def encode(self, state: Tensor) -> Tensor:
         """The first layer's share of the state: `(..., S)` to `(..., H)`."""
-        return nn.functional.linear(state, self.first.weight[:, : self.state_size])
+        return self.from_state(state)
 
     def value(self, encoded_state: Tensor, action: Tensor) -> Tensor:
         """Q from an encoded state `(..., H)` and an action `(..., A)`: shape `(...)`."""
-        share_of_action = nn.functional.linear(action, self.first.weight[:, self.state_size :], self.first.bias)
-        return self.rest(self.activation(encoded_state + share_of_action)).squeeze(-1)
+        return self.rest(self.activation(encoded_state + self.from_action(action))).squeeze(-1)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Q(s, u) for states `(..., S)` and actions `(..., A)`: shape `(...)`."""
