@@ -108,6 +108,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     All agents of all copies act in one stacked forward pass, and what comes back are arrays `(L, E, N, ...)`.
     Set by the algorithms of this package as `env_runner_cls`; `sample()` and `get_metrics()` keep RLlib's
     signatures and result keys, so RLlib's evaluation, fault tolerance and Tune work with it unchanged.
+    RLlib's `on_episode_*` callbacks are not called: there are no episode objects to hand to them.
     """
 
     @override(EnvRunner)
