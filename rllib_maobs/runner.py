@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import ray
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -418,7 +419,9 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         if COMPONENT_RL_MODULE in state and self.module is not None:
             seq_no = state.get(WEIGHTS_SEQ_NO, 0)
             if seq_no == 0 or self._weights_seq_no < seq_no:
-                self.module.set_state(state[COMPONENT_RL_MODULE])
+                weights = state[COMPONENT_RL_MODULE]
+                # RLlib puts the weights for several remote runners into the object store once.
+                self.module.set_state(ray.get(weights) if isinstance(weights, ray.ObjectRef) else weights)
             self._weights_seq_no = max(self._weights_seq_no, seq_no)
         if NUM_ENV_STEPS_SAMPLED_LIFETIME in state:
             self.num_env_steps_sampled_lifetime = state[NUM_ENV_STEPS_SAMPLED_LIFETIME]

@@ -134,7 +134,9 @@ def test_remote_runners_sample_learn_and_survive_a_kill(ray_session: None) -> No
     config = small_config("maddpg", horizon=10)
     config.env_runners(num_env_runners=1, num_envs_per_env_runner=4, rollout_fragment_length=5)
     algo = config.build_algo()
-    assert algo.train()["num_env_steps_sampled_lifetime"] == 40
+    result = algo.train()
+    assert result["num_env_steps_sampled_lifetime"] == 40
+    assert result["fault_tolerance"]["num_remote_worker_restarts"] == 0
     (weights,) = algo.env_runner_group.foreach_env_runner(
         lambda r: r.actors.flat.detach().clone(), local_env_runner=False
     )
