@@ -47,7 +47,7 @@ def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Ba
         state=normal(size, s),
         actions=torch.tanh(normal(size, n, a)),
         rewards=normal(size, n),
-        terminated=(normal(size, 1) > 0.5).float(),
+        terminated=(normal(size, 1) > 0.5).to(torch.get_default_dtype()),
         next_obs=normal(size, n, o),
         next_state=normal(size, s),
     )

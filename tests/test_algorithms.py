@@ -184,20 +184,6 @@ def test_names_survive_a_restart_of_ray(ray_session: None, tmp_path: Path) -> No
     assert results[0].metrics["num_env_steps_sampled_lifetime"] == 80
 
 
-def test_with_one_agent_all_algorithms_are_ddpg(ray_session: None) -> None:
-    """One agent's observation is the state and its action the joint action: the same numbers come out."""
-    actors = []
-    for algorithm in ALGORITHMS:
-        algo = small_config(algorithm, num_agents=1).build_algo()
-        start = algo._learner.actors.flat.detach().clone()
-        algo.train()
-        actors.append(algo._learner.actors.flat.detach().clone())
-        assert (actors[-1] - start).abs().max() > 0.01
-        algo.stop()
-    for actor in actors:
-        torch.testing.assert_close(actor, actors[0], rtol=1e-2, atol=1e-3)
-
-
 class DiscreteAgents(TwoAgents):
     def __init__(self, config: dict[str, Any]) -> None:
         super().__init__(config)
