@@ -3,11 +3,13 @@
 Run: `python tests/benchmarks/env_peers.py [--agents 9] [--copies 64] [--seconds 4] [--venv DIR]`
 
 The first run makes a virtual environment with both libraries (PyTorch and JAX come along: some gigabytes), by
-default beside the system's other temporary files; later runs use it again. Every library plays Spread with N agents
-and N targets, continuous actions, episodes of 100 steps, on one thread; observations and rewards are computed. Ours
-is played without obstacles (the same task) and with two thirds as many obstacles as agents (`spread-9a`). JaxMARL is
-compiled: a step of all copies per call, as a training loop with a policy outside of JAX calls it, and also 100 steps
-in one call, its best case.
+default beside the system's other temporary files; later runs use it again. On Linux PyPI's PyTorch brings CUDA with
+it; `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu` gets the small build.
+
+Every library plays Spread with N agents and N targets, continuous actions, episodes of 100 steps, one process at a
+time on the same core; observations and rewards are computed. Ours is played without obstacles (the same task) and
+with two thirds as many obstacles as agents (`spread-9a`), metrics included. JaxMARL is compiled: a step of all copies
+per call, as a training loop with a policy outside of JAX calls it, and also 100 steps in one call, its best case.
 """
 
 import argparse
@@ -18,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 HORIZON = 100
@@ -28,6 +31,7 @@ ONE_THREAD = {
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
+PEERS = ["vmas==1.5.2", "jaxmarl==0.2.0", "jax==0.10.2", "jaxlib==0.10.2"]
 Episode = Callable[[], None]
 
 
@@ -77,6 +81,7 @@ def jaxmarl_episode(agents: int, copies: int, in_one_call: bool) -> Episode:
     step = jax.vmap(env.step_env)
     keys = jax.random.split(jax.random.key(0), copies)
     actions = jax.random.uniform(jax.random.key(1), (HORIZON, copies, agents, 5))
+    steps = list(actions)
 
     def act(state: object, joint: jax.Array) -> tuple[object, object]:
         observations, state, rewards, _, _ = step(keys, state, dict(zip(env.agents, joint.swapaxes(0, 1), strict=True)))
@@ -89,7 +94,7 @@ def jaxmarl_episode(agents: int, copies: int, in_one_call: bool) -> Episode:
         if in_one_call:
             jax.block_until_ready(whole(state))
         else:
-            for joint in actions:
+            for joint in steps:
                 state, result = single(state, joint)
                 jax.block_until_ready(result)
 
@@ -98,6 +103,8 @@ def jaxmarl_episode(agents: int, copies: int, in_one_call: bool) -> Episode:
 
 def serve(name: str, agents: int, copies: int) -> None:
     """Be a worker: for every line of input (seconds) play as long and print environment steps per second."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, [max(os.sched_getaffinity(0))])  # XLA starts threads whatever its flags say
     episode = {
         "ours": lambda: our_episode(agents, copies, obstacles=0),
         "ours-obstacles": lambda: our_episode(agents, copies, obstacles=2 * agents // 3),
@@ -119,12 +126,14 @@ def python_of_peers(folder: Path) -> str:
     """Return the interpreter of the virtual environment, which is made if need be."""
     python = folder / "bin" / "python"
     done = folder / "installed"
-    if not done.exists():
-        print(f"making {folder} with vmas and jaxmarl ...", flush=True)
-        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-        # VMAS needs the old gym, whose set-up does not run with the newest setuptools.
-        subprocess.run([python, "-m", "pip", "install", "-q", "setuptools<80", "vmas", "jaxmarl"], check=True)
-        done.touch()
+    if not done.exists() or done.read_text() != str(PEERS):
+        print(f"making {folder} with {', '.join(PEERS)} ...", flush=True)
+        subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder)], check=True)
+        # PyTorch on its own first, so that it is the build that this package runs on; VMAS needs the old gym, whose
+        # set-up does not run with the newest setuptools.
+        for packages in (["setuptools<80", f"torch=={version('torch').partition('+')[0]}"], PEERS):
+            subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
+        done.write_text(str(PEERS))
     return str(python)
 
 

@@ -5,12 +5,10 @@ Run: `OMP_NUM_THREADS=1 python tests/benchmarks/env_speed.py [--scenario spread-
 All copies count: 64 copies stepped once are 64 environment steps. Observations, rewards, metrics and resets are
 included. The candidates take turns, so that a change in the load of the machine meets all of them; the best round
 counts. Below the table: what an agent costs in a team three times as large, in a room of the same density, and with
-`--profile` where the time of 64 copies goes.
+`--profile` where the time goes.
 """
 
 import argparse
-import cProfile
-import pstats
 import time
 from collections.abc import Callable
 
@@ -21,6 +19,7 @@ from rllib_maobs.envs import MAObsParallelEnv, VectorEnv, make_vec, parallel_env
 
 HORIZON = 100
 COPIES = (1, 8, 64)
+PROFILED = (1, 64, 1024)
 ROUNDS = 4
 Row = tuple[int, Callable[[], float]]
 
@@ -116,14 +115,47 @@ def compare_team_sizes(seconds: float) -> None:
     print(f"{'ratio':>16} {cost['27 agents'] / cost['9 agents']:8.2f}")
 
 
-def profile(scenario: str) -> None:
-    """Print where the time of 64 copies goes."""
+def profile(scenario: str, seconds: float) -> None:
+    """Print which share of the time the parts of a step take, with few and with many copies."""
     actions = np.random.default_rng(0).uniform(0, 1, (HORIZON, len(make_vec(scenario).agents), 5))
-    _, episode = vector_row(64, actions, scenario)
-    with cProfile.Profile() as profiler:
-        for _ in range(5):
-            episode()
-    pstats.Stats(profiler).sort_stats("tottime").print_stats(14)
+    shares: dict[int, dict[str, float]] = {}
+    for copies in PROFILED:
+        env = make_vec(scenario, num_envs=copies)
+        spent: dict[str, float] = {}
+        for part, owner, method in (
+            ("resets", env, "reset"),
+            ("distances, in the physics", env.world, "_measure"),
+            ("contact forces, in the physics", env.world, "_add_contact_forces"),
+            ("physics", env.world, "step"),
+            ("rewards", env.scenario, "outcome"),
+            ("metrics", env._tracker, "before_step"),
+            ("metrics", env._tracker, "update"),
+            ("observations", env, "observe"),
+        ):
+            setattr(owner, method, timed(getattr(owner, method), part, spent))
+        start = time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            vector_episode(env, actions)
+        total = time.perf_counter() - start
+        shares[copies] = {part: spent[part] / total for part in spent}
+        inside = ("physics", "rewards", "metrics", "observations", "resets")
+        shares[copies]["checks, actions, bookkeeping"] = 1.0 - sum(shares[copies][part] for part in inside)
+    print(f"\n{scenario}: where the time goes{'':>6}" + "".join(f"{copies:>7} copies" for copies in PROFILED))
+    for part in shares[PROFILED[0]]:
+        print(f"{part:>34}" + "".join(f"{shares[copies][part]:14.0%}" for copies in PROFILED))
+
+
+def timed(function: Callable[..., object], part: str, spent: dict[str, float]) -> Callable[..., object]:
+    """Return the function with its seconds added up under the name of a part."""
+    spent.setdefault(part, 0.0)
+
+    def call(*args: object, **kwargs: object) -> object:
+        start = time.perf_counter()
+        result = function(*args, **kwargs)
+        spent[part] += time.perf_counter() - start
+        return result
+
+    return call
 
 
 def main() -> None:
@@ -136,7 +168,7 @@ def main() -> None:
     compare_with_mpe2(args.scenario, args.seconds)
     compare_team_sizes(args.seconds)
     if args.profile:
-        profile(args.scenario)
+        profile(args.scenario, args.seconds)
 
 
 if __name__ == "__main__":
