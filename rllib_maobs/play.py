@@ -11,6 +11,7 @@ policies act without exploration.
 
 import argparse
 import ast
+import pickle
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -137,10 +138,10 @@ class CheckpointPolicy:
 
     Args:
         env: The environment.
-        checkpoint: Folder of an algorithm checkpoint. It holds a module per agent, or one for all.
+        checkpoint: Folder of an algorithm checkpoint. Its policy mapping says which module acts for which agent.
 
     Raises:
-        ValueError: If it does not, or observations have another size than those of the environment.
+        ValueError: If it holds none for an agent, or observations have another size than those of the environment.
     """
 
     def __init__(self, env: MAObsParallelEnv, checkpoint: Path) -> None:
@@ -153,11 +154,11 @@ class CheckpointPolicy:
                 f"--policy {str(checkpoint)!r} is illegal; legal: random, heuristic, or the folder of an RLlib "
                 f"algorithm checkpoint (with modules in {'/'.join(_MODULES)})"
             )
-        self._module_of = {}
-        for agent in env.possible_agents:
-            if agent not in found and len(found) != 1:
+        policy_of = _policy_mapping(checkpoint)
+        self._module_of = {agent: policy_of(agent) for agent in env.possible_agents}
+        for agent, module_id in self._module_of.items():
+            if module_id not in found:
                 raise ValueError(f"checkpoint {checkpoint} has no module for {agent}; it has {', '.join(found)}")
-            self._module_of[agent] = agent if agent in found else found[0]
         self._modules = {m: RLModule.from_checkpoint(folder / m) for m in sorted(set(self._module_of.values()))}
         for agent, module_id in self._module_of.items():
             trained, here = self._modules[module_id].observation_space.shape, env.observation_space(agent).shape
@@ -197,6 +198,13 @@ class CheckpointPolicy:
             action = distribution.to_deterministic().sample()
         flat = action.reshape(space.shape).numpy()
         return unsquash_action(flat, space) if space.shape else int(flat)
+
+
+def _policy_mapping(checkpoint: Path) -> Callable[[str], str]:
+    """Return the module id of an agent id, as the checkpoint's algorithm was configured."""
+    arguments = pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())["ctor_args_and_kwargs"]
+    mapping = arguments[0][0]["policy_mapping_fn"]
+    return lambda agent: str(mapping(agent, None))
 
 
 def _film(env: MAObsParallelEnv, recorder: Recorder | None) -> None:

@@ -1,10 +1,12 @@
 """The command that shows and films episodes, with every kind of policy."""
 
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
@@ -90,8 +92,6 @@ def maddpg_checkpoint(ray_session, tmp_path_factory):
 
 
 def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
-    import torch
-
     path, modules = maddpg_checkpoint
     env = parallel_env("spread-3a")
     policy = make_policy(env, path)
@@ -107,6 +107,36 @@ def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
         make_policy(parallel_env("spread-3a", num_agents=3, num_obstacles=10), path)
     with pytest.raises(ValueError, match="has no module for agent_3; it has agent_0, agent_1, agent_2"):
         make_policy(parallel_env("spread-3a", num_agents=4), path)
+
+
+def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
+    """Predators share a policy, the learned prey has another, with another observation."""
+    options = {"prey": "learned", "horizon": 5}
+    algo = (
+        PPOConfig()
+        .environment(MAObsEnv, env_config={"scenario": "obstacle-predator-prey", **options})
+        .env_runners(num_env_runners=0)
+        .multi_agent(
+            policies={"hunters", "hunted"},
+            policy_mapping_fn=lambda agent, episode, **kwargs: "hunted" if agent == "prey_0" else "hunters",
+        )
+        .build_algo()
+    )
+    path = algo.save_to_path(str(tmp_path))
+    modules = {name: algo.get_module(name) for name in ("hunters", "hunted")}
+    algo.stop()
+    env = parallel_env("obstacle-predator-prey", **options)
+    policy = make_policy(env, path)
+    observations, _ = env.reset(seed=0)
+    actions = policy(observations)
+    for agent, name in (("predator_0", "hunters"), ("predator_2", "hunters"), ("prey_0", "hunted")):
+        logits = modules[name].forward_inference({"obs": torch.from_numpy(observations[agent])[None]})
+        mean = logits["action_dist_inputs"][0, :5].detach().numpy()
+        np.testing.assert_allclose(actions[agent], np.clip(mean, -1.0, 1.0), rtol=1e-5, atol=1e-6)
+    play(env, policy)
+    shutil.rmtree(tmp_path / "learner_group" / "learner" / "rl_module" / "hunters")
+    with pytest.raises(ValueError, match="has no module for predator_0; it has hunted"):
+        make_policy(env, path)
 
 
 @pytest.mark.parametrize("use_lstm", [False, True])

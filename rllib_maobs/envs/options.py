@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import numbers
 import types
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -84,7 +85,7 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
         accepted, converted = _accept(value, inner)
         return accepted and converted in limits, converted
     if get_origin(hint) is Literal:
-        return value in get_args(hint), value
+        return isinstance(value, Hashable) and value in get_args(hint), value
     if hint is type(None):
         return value is None, None
     if hint is bool:

@@ -34,7 +34,12 @@ def register_scenario(scenario_id: str, cls: type[Scenario[Any]], **options: Any
         scenario_id: The id; it replaces a scenario of the same id.
         cls: The scenario.
         **options: Preset options; checked here, and overridden by those given when the scenario is made.
+
+    Raises:
+        ValueError: If `cls` is no scenario, or has no such options.
     """
+    if not (isinstance(cls, type) and issubclass(cls, Scenario)):
+        raise ValueError(f"cannot register {cls!r}; legal: a subclass of Scenario")
     cls(**options)
     SCENARIOS[scenario_id] = (cls, options)
 
@@ -51,9 +56,11 @@ def make_scenario(scenario: str | type[Scenario[Any]], **options: Any) -> Scenar
     """
     if isinstance(scenario, type) and issubclass(scenario, Scenario):
         return scenario(**options)
+    if not isinstance(scenario, str):
+        raise ValueError(f"scenario {scenario!r} is illegal; legal: an id, or a subclass of Scenario (not an instance)")
     if scenario not in SCENARIOS:
         legal = list(SCENARIOS)
-        raise ValueError(f"unknown scenario {scenario!r}{closest(str(scenario), legal)}; legal ids: {', '.join(legal)}")
+        raise ValueError(f"unknown scenario {scenario!r}{closest(scenario, legal)}; legal ids: {', '.join(legal)}")
     cls, preset = SCENARIOS[scenario]
     return cls(**{**preset, **options})
 

@@ -40,7 +40,7 @@ class MAObsEnv(MultiAgentEnv):
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        options = dict(config)
+        options = dict(config or {})
         if "scenario" not in options:
             raise ValueError('the env config needs a "scenario", such as {"scenario": "spread-9a"}')
         self.render_mode = options.pop("render_mode", None)

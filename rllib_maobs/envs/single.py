@@ -45,15 +45,18 @@ class SingleCopy:
 
         Raises:
             RuntimeError: If there was no reset, or the episode has ended.
-            ValueError: If an agent has no action, an action comes from an unknown agent, or one has a wrong shape.
+            ValueError: If an agent has no action, an action comes from an unknown agent, or one has a wrong shape or
+                type, is not finite or out of range; names the agent.
         """
         self.env.check_running()
         agents = self.env.agents
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"actions are a {type(actions).__name__}; expected a dict with the action of each agent")
         if set(actions) != set(agents):
             missing = [agent for agent in agents if agent not in actions]
             unknown = [agent for agent in actions if agent not in agents]
             raise ValueError(f"actions must come from {agents}; missing: {missing}, unknown: {unknown}")
-        joint = np.stack([self._check_shape(agent, np.asarray(actions[agent])) for agent in agents])[None]
+        joint = np.stack([self._check_action(agent, np.asarray(actions[agent])) for agent in agents])[None]
         observations, rewards, terminated, truncated, info = self.env.step(joint)
         if self._renderer is not None:
             self._renderer.note_step()
@@ -73,10 +76,11 @@ class SingleCopy:
         """Return the picture of the present situation, (H, W, 3), in mode "rgb_array"; None in mode "human".
 
         Raises:
-            RuntimeError: If the environment was made without a render mode.
+            RuntimeError: If the environment was made without a render mode, or was never reset.
         """
         if self._renderer is None:
             raise RuntimeError('render() needs an environment made with render_mode="rgb_array" or "human"')
+        self.env.check_begun("render")
         if self.render_mode == "rgb_array":
             return self._renderer.frame()
         self._show()
@@ -104,8 +108,11 @@ class SingleCopy:
         rows_and_sizes = zip(self.env.agents, rows, self._sizes, strict=True)
         return {agent: row[:size] for agent, row, size in rows_and_sizes}
 
-    def _check_shape(self, agent: str, action: NDArray[Any]) -> NDArray[Any]:
+    def _check_action(self, agent: str, action: NDArray[Any]) -> NDArray[Any]:
+        """Check what cannot be told any more, or not by agent, when all actions are one array."""
         expected = self.env.action_spaces[agent].shape
         if action.shape != expected:
             raise ValueError(f"action of {agent} has shape {action.shape}; expected {expected}")
+        if action.dtype.kind not in ("fiub" if expected else "iu"):
+            raise ValueError(f"action of {agent} is {action.dtype}; expected {'numbers' if expected else 'an integer'}")
         return action

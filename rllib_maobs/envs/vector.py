@@ -51,10 +51,10 @@ class VectorEnv:
     """
 
     def __init__(self, scenario: Scenario[Any], num_envs: int = 1) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs} is illegal; legal: an integer >= 1")
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r} is illegal; legal: an integer >= 1")
         self.scenario = scenario
-        self.num_envs = num_envs
+        self.num_envs = int(num_envs)
         self.agents = list(scenario.agents)
         self.horizon: int = scenario.options.horizon
         n, sizes = len(self.agents), list(scenario.observation_sizes)
@@ -121,8 +121,7 @@ class VectorEnv:
                 copy.
         """
         self.check_running()
-        actions = np.asarray(actions)
-        self._check_actions(actions)
+        actions = self._check_actions(actions)
         world, scenario = self.world, self.scenario
         control = scenario.control(actions)
         if world.num_movers > len(self.agents):
@@ -165,7 +164,9 @@ class VectorEnv:
 
         Raises:
             NotImplementedError: If the scenario has none.
+            RuntimeError: If the environment was never reset.
         """
+        self.check_begun("heuristic")
         self.world.refresh()
         return self.scenario.actions(self.scenario.heuristic(self.world))
 
@@ -175,7 +176,11 @@ class VectorEnv:
         Args:
             kind: "observations" (all agents' observations in a row, without padding) or "world" (positions of all
                 bodies, then velocities of those that move); None for the scenario's option `state`.
+
+        Raises:
+            RuntimeError: If the environment was never reset.
         """
+        self.check_begun("state")
         if self._state_kind(kind) == "world":
             return self.scenario.world_state(self.world)
         observations = self.observe()
@@ -213,15 +218,19 @@ class VectorEnv:
             self._rngs = [np.random.default_rng(s) for s in self.seeds]
         if seed is None:
             return
-        if isinstance(seed, int | np.integer):
-            seeds = int(seed) + np.arange(self.num_envs)
-        else:
-            seeds = np.asarray(seed, np.int64)
-        if seeds.shape != (self.num_envs,) or (seeds < 0).any():
+        seeds = np.asarray(seed)
+        if seeds.shape == () and seeds.dtype.kind in "iu":
+            seeds = seeds + np.arange(self.num_envs)
+        if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
             raise ValueError(f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None")
         self.seeds[copies] = seeds[copies]
         for e in copies.tolist():
             self._rngs[e] = np.random.default_rng(self.seeds[e])
+
+    def check_begun(self, method: str) -> None:
+        """Raise a RuntimeError if the environment was never reset: bodies then have no places yet."""
+        if self._rngs is None:
+            raise RuntimeError(f"{method}() before reset()")
 
     def check_running(self) -> None:
         """Raise a RuntimeError if a copy cannot be stepped: it was never reset, or its episode has ended."""
@@ -237,7 +246,11 @@ class VectorEnv:
             f"step() after the end of the episode of copies {copies}: call reset(mask=terminated | truncated) first"
         )
 
-    def _check_actions(self, actions: NDArray[Any]) -> None:
+    def _check_actions(self, joint: NDArray[Any]) -> NDArray[Any]:
+        try:
+            actions = np.asarray(joint)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"actions are no array: {error}") from None
         if actions.shape != self._actions_shape:
             letters = "(E, N)" if self._discrete else "(E, N, A)"
             raise ValueError(f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}")
@@ -245,8 +258,11 @@ class VectorEnv:
             if not np.issubdtype(actions.dtype, np.integer):
                 raise ValueError(f"discrete actions are {actions.dtype}; expected integers")
             self._reject(actions, (actions < 0) | (actions >= 5), "not in 0 .. 4")
+        elif actions.dtype.kind not in "fiub":
+            raise ValueError(f"actions are {actions.dtype}; expected numbers")
         elif not np.isfinite(actions).all():
             self._reject(actions, ~np.isfinite(actions).all(axis=-1), "not finite")
+        return actions
 
     def _reject(self, actions: NDArray[Any], bad: NDArray[np.bool_], reason: str) -> None:
         """Raise for the first bad action, if any; bad is (E, N)."""
