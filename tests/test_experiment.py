@@ -18,10 +18,12 @@ import pandas as pd
 import pytest
 from ray.rllib.algorithms import Algorithm
 
+from rllib_maobs.envs import make_vec
 from rllib_maobs.experiment import Experiment, load_curves, plot_curves, summarise
 from rllib_maobs.experiment.arguments import make_parser, parse
+from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.progress import ProgressTable, makespan
-from rllib_maobs.experiment.report import STEPS
+from rllib_maobs.experiment.report import STEPS, to_markdown
 
 SCRIPTS = Path(__file__).parent.parent / "tuned_examples"
 EXPERIMENT = Experiment(
@@ -115,6 +117,42 @@ def test_summarise() -> None:
     assert np.isnan(table.loc["maddpg", "score_std"])
 
 
+@pytest.mark.parametrize("options", [{}, {"action_mode": "discrete"}, {"terminate_on_success": True}])
+def test_baselines_are_means_over_whole_episodes(options: dict[str, Any]) -> None:
+    baselines = play_baselines("maobs/spread-3a", {"horizon": 100, **options}, episodes=20)
+    assert list(baselines) == ["random", "heuristic"]
+    assert -900 < baselines["random"]["return_agent_0"] < -650 < -90 < baselines["heuristic"]["return_agent_0"] < 0
+    assert baselines["random"]["success"] == 0.0 < 0.9 < baselines["heuristic"]["success"] <= 1.0
+    length = baselines["heuristic"]["episode_length"]
+    assert length == 100.0 if "terminate_on_success" not in options else 5.0 < length < 60.0
+    single = make_vec("spread-3a", **options)
+    single.reset(seed=0)
+    returned, done = 0.0, False
+    while not done:
+        _, rewards, terminated, truncated, _ = single.step(single.heuristic())
+        returned, done = returned + float(rewards[0, 0]), bool(terminated[0] | truncated[0])
+    alone = play_baselines("maobs/spread-3a", options, episodes=1)["heuristic"]
+    assert alone["return_agent_0"] == pytest.approx(returned, rel=1e-5)
+
+
+def test_baselines_end_the_table() -> None:
+    baselines = play_baselines("maobs/spread-3a", {}, episodes=2)
+    *_, trained, random, heuristic = to_markdown(summarise(made_up_curves()), baselines).splitlines()
+    assert trained.startswith("| iddpg ") and random.startswith("| random ") and heuristic.startswith("| heuristic ")
+    cells = [cell.strip() for cell in random.strip("|").split("|")]
+    means = baselines["random"]
+    assert cells == [
+        "random",
+        "-",
+        "-",
+        f"{means['return_agent_0']:.1f}",
+        f"{means['coverage']:.2f}",
+        "-",
+        "-",
+    ]
+    assert play_baselines("my_env", {}) == {}
+
+
 def test_plot_curves_draws_mean_and_spread(tmp_path: Path) -> None:
     plot_curves(made_up_curves(), tmp_path / "curves.png", "title")
     both = matplotlib.image.imread(tmp_path / "curves.png")
@@ -159,7 +197,8 @@ def test_the_end_of_a_run(
     args = parse(make_parser("demo", EXPERIMENT.algorithms, 1000), "demo", ["--results-dir", str(tmp_path / "new")])
     args.results_dir = tmp_path
     assert (EXPERIMENT._report(args, trials, planned=2) or None) == code  # type: ignore[arg-type]
-    assert says.format(tmp_path) in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert says.format(tmp_path) in output and "| heuristic " in output
     # A trial that failed is drawn, but not compared.
     assert load_curves(tmp_path)["trial"].nunique() == 2
     compared = pd.read_csv(tmp_path / "comparison.csv")["algorithm"].tolist()

@@ -45,13 +45,16 @@ def evaluation_metrics(result: Mapping[str, Any]) -> dict[str, float]:
         (with agents, obstacles and walls together). Empty if no episode has been evaluated yet.
     """
     runners = result.get("evaluation", {}).get("env_runners", {})
-    metrics = {name: float(value) for name, value in runners.get("episode_metrics", {}).items()}
-    collisions = [value for name, value in metrics.items() if name.startswith("collisions_")]
-    if collisions:
-        metrics["collisions"] = sum(collisions)
+    metrics = _with_collisions(runners.get("episode_metrics", {}))
     if returns := runners.get("agent_episode_returns_mean"):
         metrics[SCORE] = float(returns[min(returns)])
     return metrics
+
+
+def _with_collisions(episode_metrics: Mapping[str, Any]) -> dict[str, float]:
+    metrics = {name: float(value) for name, value in episode_metrics.items()}
+    collisions = [value for name, value in metrics.items() if name.startswith("collisions_")]
+    return metrics | ({"collisions": sum(collisions)} if collisions else {})
 
 
 def load_curves(results_dir: str | Path) -> pd.DataFrame:
@@ -152,11 +155,12 @@ def summarise(curves: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
     return table
 
 
-def to_markdown(table: pd.DataFrame) -> str:
+def to_markdown(table: pd.DataFrame, baselines: Mapping[str, Mapping[str, float]] | None = None) -> str:
     """Write the table of `summarise` as markdown.
 
     Args:
         table: From `summarise`.
+        baselines: Metrics of policies that are not trained, from `play_baselines`; the last rows.
 
     Returns:
         A markdown table, aligned to be read as plain text too.
@@ -170,6 +174,10 @@ def to_markdown(table: pd.DataFrame) -> str:
         if SCORE in measures and row["seeds"] > 1:
             cells[3 + measures.index(SCORE)] += f" ± {row['score_std']:.1f}"
         rows.append([*cells, f"{row['env_steps_per_s']:.0f}", format_time(3600 * row["hours"])])
+    for policy, metrics in (baselines or {}).items():
+        measured = {**_with_collisions(metrics), SCORE: metrics["return_agent_0"]}
+        cells = [format_metric(name, measured[name]) if name in measured else "-" for name in measures]
+        rows.append([policy, "-", "-", *cells, "-", "-"])
     return format_table(header, rows, markdown=True)
 
 
@@ -215,13 +223,19 @@ def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points:
     figure.savefig(path, dpi=150)
 
 
-def write_report(results_dir: Path, title: str, failed: Collection[str] = ()) -> str:
+def write_report(
+    results_dir: Path,
+    title: str,
+    failed: Collection[str] = (),
+    baselines: Mapping[str, Mapping[str, float]] | None = None,
+) -> str:
     """Write the `FILES` into the results folder, and complete the trials' progress.csv.
 
     Args:
         results_dir: The folder that the experiment wrote to.
         title: Heading of the picture and of the table.
         failed: Trials that are left out of the comparison; their curves are drawn as far as they got.
+        baselines: Metrics of policies that are not trained, from `play_baselines`: rows of the markdown table.
 
     Returns:
         The comparison table as markdown, and what its numbers are.
@@ -240,8 +254,10 @@ def write_report(results_dir: Path, title: str, failed: Collection[str] = ()) ->
         f"Noise-free evaluation: means over the last {LAST} evaluations of each trial, then over the seeds (score: ± "
         f"their standard deviation). Time is h:mm:ss per trial."
     )
+    if baselines:
+        note += f" Not trained: {' and '.join(baselines)}, means over 100 episodes."
     if failed:
         note += f" Failed and left out: {', '.join(failed)}."
-    markdown = f"{to_markdown(table)}\n\n{note}"
+    markdown = f"{to_markdown(table, baselines)}\n\n{note}"
     (results_dir / "comparison.md").write_text(f"# {title}\n\n{markdown}\n")
     return markdown

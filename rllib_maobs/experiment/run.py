@@ -19,6 +19,7 @@ from ray import tune
 
 import rllib_maobs as maobs
 from rllib_maobs.experiment.arguments import PAPER_HORIZON, has_started, make_parser, parse, save_settings
+from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import FILES, STEPS, write_report
 from rllib_maobs.experiment.tables import format_table, format_time
@@ -162,7 +163,8 @@ class Experiment:
         """Write and print the results; return the exit code."""
         failed = [Path(trial.path) for trial in trials if trial.error]
         try:
-            print(f"\n{write_report(args.results_dir, self.name, [path.name for path in failed])}\n")
+            baselines = play_baselines(self.env, {**self.env_config, "horizon": PAPER_HORIZON})
+            print(f"\n{write_report(args.results_dir, self.name, [path.name for path in failed], baselines)}\n")
             print(f"In {args.results_dir}: {', '.join(FILES)}")
         except FileNotFoundError as error:
             print(error)
