@@ -4,6 +4,7 @@ import copy
 import pickle
 import sys
 import warnings
+from functools import partial
 from types import SimpleNamespace
 
 import imageio.v2 as imageio
@@ -34,14 +35,21 @@ def scenario_id(request):
 # PettingZoo's checks.
 
 
-def test_pettingzoo_render_test(scenario_id, recwarn):
-    render_test(lambda render_mode: parallel_to_aec(parallel_env(scenario_id, render_mode=render_mode, horizon=20)))
+@pytest.fixture(params=[*IDS, "learned prey"])
+def make_env(request):
+    if request.param == "learned prey":
+        return partial(parallel_env, "obstacle-predator-prey", prey="learned")
+    return partial(parallel_env, request.param)
+
+
+def test_pettingzoo_render_test(make_env, recwarn):
+    render_test(lambda render_mode: parallel_to_aec(make_env(render_mode=render_mode, horizon=20)))
     assert not [str(w.message) for w in recwarn]
 
 
-def test_pettingzoo_max_cycles_test(scenario_id, recwarn):
+def test_pettingzoo_max_cycles_test(make_env, recwarn):
     def parallel(max_cycles):
-        return parallel_env(scenario_id, horizon=max_cycles)
+        return make_env(horizon=max_cycles)
 
     max_cycles_test(
         SimpleNamespace(parallel_env=parallel, env=lambda max_cycles: parallel_to_aec(parallel(max_cycles)))
@@ -49,14 +57,14 @@ def test_pettingzoo_max_cycles_test(scenario_id, recwarn):
     assert not [str(w.message) for w in recwarn]
 
 
-def test_pettingzoo_seed_test(scenario_id, recwarn):
-    parallel_seed_test(lambda: parallel_env(scenario_id, horizon=30))
+def test_pettingzoo_seed_test(make_env, recwarn):
+    parallel_seed_test(lambda: make_env(horizon=30))
     assert not [str(w.message) for w in recwarn]
 
 
 @pytest.mark.parametrize("state", ["observations", "world"])
-def test_pettingzoo_state_test(scenario_id, state):
-    env = parallel_env(scenario_id, state=state)
+def test_pettingzoo_state_test(make_env, state):
+    env = make_env(state=state)
     env.reset(seed=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

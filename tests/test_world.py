@@ -1,11 +1,13 @@
 """Physics: against MPE2, against steps computed by hand, and at the edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mpe2._mpe_utils.core import Agent, Landmark
 from mpe2._mpe_utils.core import World as MPE2World
 
-from rllib_maobs.envs import Bodies, Wall, World
+from rllib_maobs.envs import SCENARIOS, Bodies, Wall, World, make_scenario
 
 DT, DAMPING, MARGIN, STIFFNESS = 0.1, 0.25, 1e-3, 100.0
 
@@ -158,6 +160,28 @@ def test_head_on_at_full_speed(physics, passes):
         touched |= world.contacts("agent").any(axis=1)
     assert touched.all()
     assert (world.position[:, 0, 0] > world.position[:, 1, 0]).any() == passes
+
+
+@pytest.mark.parametrize("scenario_id", sorted(SCENARIOS))
+@pytest.mark.parametrize("along", [[1.0, 0.0], [1.0, 1.0]])
+def test_solid_bodies_of_every_scenario_never_pass_at_full_thrust(scenario_id, along):
+    """Every kind of pair, head-on from 100 distances, as fast as the scenario lets them and still pushing."""
+    scenario = make_scenario(scenario_id, physics="solid")
+    kinds = [group for group in scenario.bodies() if group.collides]
+    for one in (kind for kind in kinds if kind.movable):
+        for other in (kind for kind in kinds if kind is not one or one.count > 1):
+            pair = [replace(one, name="one", count=1), replace(other, name="other", count=1)]
+            world = World(100, pair, physics="solid")
+            contact = one.radius + other.radius
+            direction = np.array(along) / np.linalg.norm(along)
+            world.position[:, 1] = (contact + np.linspace(0.01, 1.5, 100))[:, None] * direction
+            push = np.array(along) * [[one.accel], [-other.accel]]
+            touched = np.zeros(100, bool)
+            for _ in range(60):
+                world.step(np.tile(push[: world.num_movers], (100, 1, 1)))
+                touched |= world.gap[:, 0, 1] < 0.0  # at the end of some step, if not of the first
+                assert ((world.position[:, 1] - world.position[:, 0]) @ direction > 0.0).all()
+            assert touched.all()
 
 
 def test_contacts_count_neither_self_nor_targets():

@@ -78,7 +78,8 @@ class Physics:
 
 PHYSICS: dict[str, Physics] = {
     "mpe": Physics(),
-    # Stiffer, in shorter steps: two bodies head-on at speed 1 bounce; in "mpe" they pass through each other.
+    # Stiffer, in shorter steps: bodies head-on at the scenarios' speed limits bounce; in "mpe" they pass through each
+    # other. Small ones without a limit may still be fast enough to pass (radius 0.075, speeds of 2.8 each).
     "solid": Physics(contact_force=500.0, substeps=5),
 }
 
