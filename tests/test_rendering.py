@@ -280,6 +280,13 @@ def test_films_show_every_picture(tmp_path, name):
     assert path.stat().st_size < 200_000
 
 
+@pytest.mark.parametrize(("name", "writer"), [("film.gif", "PIL.Image"), ("film.mp4", "imageio_ffmpeg")])
+def test_recorder_says_at_once_what_is_not_installed(monkeypatch, name, writer):
+    monkeypatch.setitem(sys.modules, writer, None)
+    with pytest.raises(ImportError, match=rf'recording needs {writer}: pip install "rllib-maobs\[render\]"'):
+        Recorder(name)
+
+
 def test_recorder_errors(tmp_path):
     with pytest.raises(ValueError, match=r"cannot record to 'film\.avi'; legal are names that end in \.gif or \.mp4"):
         Recorder("film.avi")

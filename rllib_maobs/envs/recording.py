@@ -9,7 +9,7 @@ import numpy as np
 
 from rllib_maobs.envs.rendering import Frame
 
-_FORMATS = (".gif", ".mp4")
+_WRITERS = {".gif": ("PIL.Image",), ".mp4": ("imageio.v2", "imageio_ffmpeg")}
 
 
 class Recorder:
@@ -32,12 +32,15 @@ class Recorder:
 
     Raises:
         ValueError: If the name ends differently.
+        ImportError: If what writes such a file is not installed.
     """
 
     def __init__(self, path: str | Path, frames_per_second: int = 10) -> None:
         self.path = Path(path)
-        if self.path.suffix.lower() not in _FORMATS:
-            raise ValueError(f"cannot record to {str(path)!r}; legal are names that end in {' or '.join(_FORMATS)}")
+        if self.path.suffix.lower() not in _WRITERS:
+            raise ValueError(f"cannot record to {str(path)!r}; legal are names that end in {' or '.join(_WRITERS)}")
+        for name in _WRITERS[self.path.suffix.lower()]:
+            _import(name)  # rather now than after the episode
         self.frames_per_second = frames_per_second
         self._frames: list[Frame] = []
 
@@ -63,7 +66,6 @@ class Recorder:
 
         Raises:
             ValueError: If there is no picture.
-            ImportError: If what writes such a file is not installed.
         """
         if not self._frames:
             raise ValueError(f"nothing to write to {self.path}: no picture was added")
@@ -87,7 +89,6 @@ def _write_gif(path: Path, frames: list[Frame], frames_per_second: int) -> None:
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: int) -> None:
-    _import("imageio_ffmpeg")
     imageio = _import("imageio.v2")
     with imageio.get_writer(path, fps=frames_per_second, macro_block_size=2) as writer:
         for frame in frames:
