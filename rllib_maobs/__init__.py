@@ -4,14 +4,24 @@ from ray.tune.registry import register_trainable
 
 from rllib_maobs.algorithms import (
     ALGORITHMS,
+    FACMAC,
     IDDPG,
+    IQL,
     MADDPG,
     MADDPGL,
+    MADDPGLSTM,
+    QMIX,
+    VDN,
+    FACMACConfig,
     IDDPGConfig,
+    IQLConfig,
     JointAlgorithm,
     JointConfig,
     MADDPGConfig,
     MADDPGLConfig,
+    MADDPGLSTMConfig,
+    QMIXConfig,
+    VDNConfig,
 )
 from rllib_maobs.envs import (
     SCENARIOS,
@@ -26,7 +36,7 @@ from rllib_maobs.envs import (
 )
 from rllib_maobs.envs.joint import register_envs
 from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import AgentModule
+from rllib_maobs.modules import AgentModule, Critic, LSTMActor, Mixer, MLPActor, UtilityModule
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointEnvRunner
 
@@ -39,29 +49,44 @@ def register() -> None:
     Ray forgets names when it is shut down, so this may be called again, as often as you like.
     """
     register_envs()
-    for algorithm in (IDDPG, MADDPG, MADDPGL):
+    for algorithm in (IDDPG, MADDPG, MADDPGLSTM, MADDPGL, FACMAC, IQL, VDN, QMIX):
         register_trainable(algorithm.__name__, algorithm)
 
 
 __all__ = [
     "ALGORITHMS",
+    "FACMAC",
     "IDDPG",
+    "IQL",
     "MADDPG",
     "MADDPGL",
+    "MADDPGLSTM",
+    "QMIX",
     "SCENARIOS",
+    "VDN",
     "AgentModule",
+    "Critic",
     "EpisodeMetricsCallback",
+    "FACMACConfig",
     "IDDPGConfig",
+    "IQLConfig",
     "JointAlgorithm",
     "JointConfig",
     "JointEnvRunner",
     "JointLearner",
     "JointReplayBuffer",
+    "LSTMActor",
     "MADDPGConfig",
     "MADDPGLConfig",
+    "MADDPGLSTMConfig",
     "MAObsEnv",
+    "MLPActor",
+    "Mixer",
+    "QMIXConfig",
     "Recorder",
     "Scenario",
+    "UtilityModule",
+    "VDNConfig",
     "VectorEnv",
     "make_vec",
     "parallel_env",

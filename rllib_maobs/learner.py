@@ -6,100 +6,199 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from ray.rllib.core import ALL_MODULES
 from ray.rllib.core.learner.learner import Learner
 from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.core.learner.training_data import TrainingData
 from ray.rllib.utils.annotations import override
-from ray.rllib.utils.metrics import NUM_ENV_STEPS_TRAINED, NUM_ENV_STEPS_TRAINED_LIFETIME
+from ray.rllib.utils.metrics import (
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    NUM_ENV_STEPS_TRAINED,
+    NUM_ENV_STEPS_TRAINED_LIFETIME,
+)
 from torch import Tensor
 from torch.func import grad_and_value
+from torch.nn import functional as F
 
-from rllib_maobs.modules.stack import Params, Stack
+from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.exploration import gumbel
+from rllib_maobs.modules.normalizer import merge
 
+MIXER = "mixer"
 NUM_UPDATES_LIFETIME = "num_updates_lifetime"
+_PROGRESS = "progress"
+Columns = dict[str, Tensor]
+"""A minibatch as replay gives it, see `JointReplayBuffer.sample`."""
 
 
 class Batch(NamedTuple):
-    """A minibatch of joint transitions."""
+    """A minibatch as the losses see it."""
 
     obs: Tensor  # (B, N, O)
+    history: tuple[Tensor, ...]  # what actors see: (obs,), or windows (B, N, T, O) and their mask (B, T)
     state: Tensor  # (B, S)
-    actions: Tensor  # (B, N, A) in [-1, 1]
-    rewards: Tensor  # (B, N)
-    terminated: Tensor  # (B, 1): 1.0 where the episode really ended; a time limit is 0.0 and bootstraps
-    next_obs: Tensor  # (B, N, O)
-    next_state: Tensor  # (B, S)
+    actions: Tensor  # (B, N, A) in [-1, 1], or one-hot
+    rewards: Tensor  # (B, N), of n steps
+    discount: Tensor  # (B, 1): gamma^n, or 0.0 where the episode really ended; a time limit bootstraps
+    next_obs: Tensor  # (B, N, O), n steps later
+    next_history: tuple[Tensor, ...]
+    next_state: Tensor
+    noise: Tensor | None  # (B, N, A): normal for smoothed target actions, uniform for discrete actors
 
 
 class Nets(NamedTuple):
-    """Parameters of all agents, by role."""
+    """Stacked parameters by role; empty where an algorithm has no such role."""
 
     actor: Params
     critic: Params
+    mixer: Params
 
 
 class JointLearner(TorchLearner):
-    """Trains a fixed team of actors and critics from joint minibatches.
+    """Trains a fixed team from joint minibatches; the base of all learners here.
 
-    An algorithm overrides `critic_loss` and `actor_loss`. Both are given the same parameters, those from
-    before the update: first both gradients are computed, then critics and actors step, then the targets
-    move (the order of the code base the paper grew from). The critic loss moves critics and nothing else, the
-    actor loss actors: each gradient is taken with respect to its own role alone.
+    An algorithm overrides `critic_loss` and, if it has actors, `actor_loss`. Both are given the same parameters,
+    those from before the update: first all gradients are computed, then critics (with their mixer) and actors
+    step, then the targets move (the order of the code base the paper grew from). The critic loss moves critics
+    and nothing else, the actor loss actors: each gradient is taken with respect to its own role alone.
 
     All agents' networks are stacked (see `Stack`), so a loss is one batched computation instead of a loop
     over agents. With `config.framework(torch_compile_learner=True)` it is compiled, once per run; the numbers
     are the same up to float rounding.
     """
 
+    has_actors = True
+
     @override(TorchLearner)
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         # RLlib would compile forward_train, which a stacked update never calls; what is compiled is ours.
         self._torch_compile_forward_train = self._torch_compile_complete_update = False
-        self._sums: dict[str, Tensor] = {}
-        self._updates = 0
+        self._sum: Tensor | None = None
+        self._updates = self._whole_updates = 0
+        self._updates_lifetime = 0
+        # What the losses may depend on but for tensors: each combination is compiled on its own.
+        self.stage = ""
+        self._compiled: dict[tuple[str, bool], Callable[..., Any]] = {}
+        self._with_actors = self.has_actors
 
     @override(TorchLearner)
     def configure_optimizers(self) -> None:
-        """Stacks the agents' networks and registers one Adam per role (called by RLlib's `build`)."""
-        modules = [self.module[mid].unwrapped() for mid in self.config.module_ids]
-        encode = ("encode", "value")
-        self.actors = Stack([m.actor for m in modules])
-        self.critics = Stack([m.critic for m in modules], encode)
-        self.target_actors = Stack([m.target_actor for m in modules])
-        self.target_critics = Stack([m.target_critic for m in modules], encode)
-        for role, stack, lr in (
-            ("actor", self.actors, self.config.actor_lr),
-            ("critic", self.critics, self.config.critic_lr),
-        ):
-            self.register_optimizer(
-                module_id=ALL_MODULES,
-                optimizer_name=role,
-                optimizer=torch.optim.Adam([stack.flat], fused=True),
-                params=[stack.flat],
-                lr_or_lr_schedule=lr,
-            )
-        self.gradients: Callable[..., tuple[Tensor, Tensor, dict[str, Tensor]]] = self._gradients
-        if self.config.torch_compile_learner:
-            # Code of its own: compiled code is kept per code object, and those unchecked things differ by learner.
-            own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
-            self.gradients = torch.compile(
-                MethodType(own, self),
-                fullgraph=True,
-                dynamic=False,
-                backend=self.config.torch_compile_learner_dynamo_backend,
-                mode=self.config.torch_compile_learner_dynamo_mode,
-                # Nothing but the tensors changes between calls, so nothing else need be checked at every one.
-                options=None
-                if self.config.torch_compile_learner_dynamo_mode
-                else {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
-            )
+        """Stacks the agents' networks and registers the optimisers (called by RLlib's `build`).
 
-    def act(self, actor: Params, obs: Tensor) -> Tensor:
-        """Every agent's mu_i(o_i): observations `(B, N, O)` to actions `(B, N, A)` in [-1, 1]."""
-        return self.actors(actor, (obs, 1))
+        One Adam for the actors, and one for the critics together with their mixers.
+        """
+        config, team = self.config, self.config.team
+        modules = [self.module[mid].unwrapped() for mid in config.module_ids]
+        self._roles, self._targets = self.stacks(modules)
+        self.normalizers = Stack([m.normalizer for m in modules]) if config.normalize_observations else None
+        for role, trained, lr in (
+            ("critic", ("critic", "mixer"), config.critic_lr),
+            ("actor", ("actor",), config.actor_lr),
+        ):
+            parameters = [self._roles[name].flat for name in trained if name in self._roles]
+            if parameters:
+                self.register_optimizer(
+                    module_id=ALL_MODULES,
+                    optimizer_name=role,
+                    optimizer=torch.optim.Adam(parameters, fused=True),
+                    params=parameters,
+                    lr_or_lr_schedule=lr,
+                )
+        # Constants of the losses, and the random numbers that they need, drawn outside of what is compiled.
+        device = self._device
+        mask = torch.from_numpy(team.action_mask).to(device)
+        self._action_mask = None if mask.all() else mask
+        ids = torch.eye(len(team.agents), device=device)
+        self._ids = ids if config.agent_id_input and config.central_critic else None
+        columns = torch.tensor(config.state_columns, device=device)
+        self._state_columns = None if len(columns) == len(team.agents) * team.observation_size else columns
+        self._draw: Callable[..., Tensor] | None = None
+        if self.has_actors:
+            self._draw = torch.rand if team.discrete else torch.randn if config.target_noise else None
+        self._generator = torch.Generator().manual_seed(config.seed or 0)
+
+    def stacks(self, modules: list[Any]) -> tuple[dict[str, Stack], dict[str, Stack]]:
+        """Stacks every agent's networks.
+
+        Args:
+            modules: The agents' RLModules; one that several share is listed for each of them.
+
+        Returns:
+            The stacks of each role ("actor", "critic", "mixer"), and those of their target networks.
+        """
+        tie = self.config.ties_critics
+        online, target = (
+            {
+                "actor": Stack([getattr(m, f"{prefix}actor") for m in modules], ("forward", "raw")),
+                "critic": Stack([getattr(m, f"{prefix}critic") for m in modules], ("encode", "value"), tie=tie),
+            }
+            for prefix in ("", "target_")
+        )
+        return online | self.mixer_stack(), target | self.mixer_stack("target_")
+
+    def mixer_stack(self, prefix: str = "") -> dict[str, Stack]:
+        """The mixers, stacked, under their role; nothing if the algorithm has none."""
+        return (
+            {MIXER: Stack(list(getattr(self.module[MIXER].unwrapped(), f"{prefix}mixers")))}
+            if MIXER in self.module
+            else {}
+        )
+
+    @property
+    def acting(self) -> Stack:
+        """The networks that act."""
+        return self._roles["actor"]
+
+    @property
+    def critics(self) -> Stack:
+        """The critics."""
+        return self._roles["critic"]
+
+    # What the equations are made of.
+
+    def act(self, actor: Params, history: tuple[Tensor, ...]) -> Tensor:
+        """Every agent's network on what it sees, before tanh: `(B, N, A)`."""
+        dims = (1, None)[: len(history)]
+        return self._roles["actor"](actor, *zip(history, dims, strict=True), method="raw")
+
+    def actions(self, output: Tensor, noise: Tensor | None) -> Tensor:
+        """Actions of the actors' outputs: tanh, or for discrete actions a straight-through Gumbel-softmax.
+
+        The discrete action is one-hot, a draw from the softmax of the outputs; its gradient is that of the
+        softmax itself (Jang et al. 2017).
+
+        Args:
+            output: Of `act`, `(B, N, A)`.
+            noise: Uniform random numbers in [0, 1) of the same shape, if actions are discrete.
+
+        Returns:
+            `(B, N, A)`.
+        """
+        if not self.config.team.discrete:
+            actions = torch.tanh(output)
+            return actions if self._action_mask is None else actions * self._action_mask
+        assert noise is not None
+        logits = output if self._action_mask is None else output.masked_fill(~self._action_mask, -1e9)
+        soft = F.softmax((logits + gumbel(noise)) / self.config.gumbel_temperature, dim=-1)
+        return F.one_hot(soft.argmax(-1), soft.shape[-1]) + soft - soft.detach()
+
+    def next_actions(self, actor: Params, batch: Batch) -> Tensor:
+        """The target actors' actions mu'(o'), smoothed by clipped noise if so configured: `(B, N, A)`."""
+        output, config = self.act(actor, batch.next_history), self.config
+        if config.team.discrete:
+            logits = output if self._action_mask is None else output.masked_fill(~self._action_mask, -1e9)
+            return F.one_hot(logits.argmax(-1), output.shape[-1]).to(output.dtype)
+        actions = self.actions(output, None)
+        if not config.target_noise:
+            return actions
+        assert batch.noise is not None
+        limit = config.target_noise_clip
+        actions = (actions + (config.target_noise * batch.noise).clamp(-limit, limit)).clamp(-1.0, 1.0)
+        return actions if self._action_mask is None else actions * self._action_mask
 
     def encode(self, critic: Params, state: Tensor) -> Tensor:
         """The critics' share of what they see of the state, to be used by both losses.
@@ -114,8 +213,9 @@ class JointLearner(TorchLearner):
         if state.dim() == 3:
             return self.critics(critic, (state, 1), method="encode")
         # One state for all: one wide matrix product instead of N narrow ones.
-        weight = critic["from_state.weight"]  # (N, H, S)
-        return torch.nn.functional.linear(state, weight.flatten(0, 1)).unflatten(-1, weight.shape[:2])
+        weight = critic["from_state.weight"]  # (rows, H, S)
+        encoded = F.linear(state, weight.flatten(0, 1)).unflatten(-1, weight.shape[:2])
+        return self.critics.spread(encoded, dim=1)
 
     def q(self, critic: Params, encoded: Tensor, actions: Tensor) -> Tensor:
         """Every agent's Q_i.
@@ -127,75 +227,230 @@ class JointLearner(TorchLearner):
                 for each `(B, N, ...)`.
 
         Returns:
-            `(B, N)`.
+            `(B, N, C)`; C is 1, or 2 with `twin_critics`.
         """
+        if self._ids is not None:
+            each = actions if actions.dim() == 3 else actions.unsqueeze(1).expand(-1, len(self._ids), -1)
+            actions = torch.cat([each, self._ids.expand(len(each), -1, -1)], dim=-1)
         return self.critics(critic, (encoded, 1), (actions, 1 if actions.dim() == 3 else None), method="value")
 
-    def critic_loss(self, critic: Params, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    @staticmethod
+    def own_actions(actions: Tensor, fixed: Tensor) -> Tensor:
+        """For every agent a the joint action in which its own is its current one and the others' are fixed.
+
+        Args:
+            actions: Current actions, with a gradient, `(B, N, A)`.
+            fixed: The others', `(B, N, A)`.
+
+        Returns:
+            `(B, N, N, A)`; the first N runs over the agents a.
+        """
+        own = torch.eye(actions.shape[1], device=actions.device, dtype=actions.dtype)[:, :, None]  # (N, N, 1)
+        return own * actions[:, None] + (1.0 - own) * fixed[:, None]
+
+    @staticmethod
+    def squared_error(y: Tensor, q: Tensor) -> Tensor:
+        """E[(y - Q)^2] of every agent `(N,)` for targets `(B, N)` and `(B, N, C)`; summed over the C critics."""
+        return (y.unsqueeze(-1) - q).square().mean(0).sum(-1)
+
+    def mix(self, mixer: Params, q: Tensor, state: Tensor) -> Tensor:
+        """Every mixer's Q_tot(s, Q_1..Q_N).
+
+        Args:
+            mixer: Parameters of the M mixers.
+            q: The values to mix: `(B, N)` for all mixers, or `(B, M, N)`.
+            state: s, `(B, S)`.
+
+        Returns:
+            `(B, M)`.
+        """
+        return self._roles["mixer"](mixer, (q, 1 if q.dim() == 3 else None), (state, None))
+
+    # What an algorithm defines.
+
+    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor | tuple[()]]:
         """The critics' loss, as the algorithm defines it.
 
         Args:
-            critic: Parameters the gradient is taken to.
+            nets: Parameters; the gradient is taken to those of the critic and the mixer.
             target: Target parameters.
             batch: The minibatch.
 
         Returns:
-            Every agent's loss `(N,)`, its Q `(B, N)` and the encoded state `(B, N, H)` that the actor loss reuses.
+            The losses, one for each agent `(N,)` or one for the team `(1,)`; what they are the losses of, `(B, N)`
+            or `(B, 1)`; and the encoded state that the actor loss uses again, if there is one.
         """
         raise TypeError(f"{type(self).__name__} defines no critic_loss: derive a learner that does.")
 
-    def actor_loss(self, actor: Params, critic: Params, encoded: Tensor, batch: Batch) -> Tensor:
+    def actor_loss(self, actions: Tensor, nets: Nets, encoded: Any, batch: Batch) -> Tensor:
         """The actors' loss, as the algorithm defines it.
 
         Args:
-            actor: Parameters the gradient is taken to.
-            critic: The critics as they were before this update.
-            encoded: The state as those critics encode it, `(B, N, H)`.
+            actions: mu(o), every actor's current action, `(B, N, A)`; the gradient goes through them.
+            nets: Parameters from before the update.
+            encoded: The state as those critics encode it (third result of `critic_loss`).
             batch: The minibatch.
 
         Returns:
-            Every agent's loss, `(N,)`.
+            The losses, `(N,)` or `(1,)`.
         """
         raise TypeError(f"{type(self).__name__} defines no actor_loss: derive a learner that does.")
 
-    def _gradients(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Both roles' gradients as flat vectors, and what there is to report."""
+    @property
+    def trains_mixer(self) -> bool:
+        """Whether there is a mixer and this stage trains it."""
+        return "mixer" in self._roles
 
-        def critic_loss(critic: Params) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-            losses, q, encoded = self.critic_loss(critic, target, batch)
+    def stage_at(self, env_steps: int) -> str:
+        """The training stage after some env steps, for algorithms that change their losses on the way."""
+        return ""
+
+    # The update.
+
+    def prepare(self, columns: Columns, normalizer: Params) -> Batch:
+        """A minibatch as the losses see it: normalised, scaled, and with the state put together."""
+        seen: dict[str, tuple[Tensor, ...]] = {}
+        for prefix in ("", "next_"):
+            if f"{prefix}window" in columns:
+                # (B, T, N, O) in replay, where a window is T rows
+                seen[prefix] = columns[f"{prefix}window"].transpose(1, 2), columns[f"{prefix}mask"]
+            else:
+                seen[prefix] = (columns[f"{prefix}obs"],)
+            if self.normalizers is not None:
+                seen[prefix] = self.normalizers(normalizer, (seen[prefix][0], 1)), *seen[prefix][1:]
+        obs, next_obs = (h[0] if h[0].dim() == 3 else h[0][:, :, -1] for h in (seen[""], seen["next_"]))
+        if "state" in columns:
+            state, next_state = columns["state"], columns["next_state"]
+        else:
+            state, next_state = obs.flatten(1), next_obs.flatten(1)
+            if self._state_columns is not None:
+                state, next_state = state[:, self._state_columns], next_state[:, self._state_columns]
+        rewards = columns["rewards"] * self.config.reward_scale
+        return Batch(
+            obs=obs,
+            history=seen[""],
+            state=state,
+            actions=columns["actions"],
+            rewards=rewards,
+            discount=columns["discount"],
+            next_obs=next_obs,
+            next_history=seen["next_"],
+            next_state=next_state,
+            noise=columns.get("noise"),
+        )
+
+    def _gradients(
+        self, nets: Nets, target: Nets, normalizer: Params, columns: Columns
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """All roles' gradients as flat vectors, and the report: losses and Q of every agent, `(3, N)`."""
+        batch = self.prepare(columns, normalizer)
+
+        def critic_loss(critic: Params, mixer: Params) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor | tuple[()]]]:
+            losses, q, encoded = self.critic_loss(Nets(nets.actor, critic, mixer), target, batch)
             return losses.sum(), (losses, q, encoded)
 
         def actor_loss(actor: Params) -> tuple[Tensor, Tensor]:
-            losses = self.actor_loss(actor, nets.critic, encoded, batch)
-            return losses.sum(), losses
+            output = self.act(actor, batch.history)
+            losses = self.actor_loss(self.actions(output, batch.noise), nets, encoded, batch)
+            total = losses.sum()
+            if self.config.action_regularization:
+                total = total + self.config.action_regularization * output.square().mean((0, 2)).sum()
+            return total, losses
 
         # Sums over agents only gather the losses: agent i's parameters are in no other agent's loss, but for
-        # the algorithms whose actor loss is joint by definition.
-        critic_gradient, (_, (critic_losses, q, encoded)) = grad_and_value(critic_loss, has_aux=True)(nets.critic)
-        actor_gradient, (_, actor_losses) = grad_and_value(actor_loss, has_aux=True)(nets.actor)
-        report = {"critic_loss": critic_losses, "actor_loss": actor_losses, "q_mean": q.mean(0)}
-        return self.actors.flatten(actor_gradient), self.critics.flatten(critic_gradient), report
+        # the algorithms whose loss is joint by definition, and agents that share their parameters.
+        gradients, (_, (critic_losses, q, encoded)) = grad_and_value(critic_loss, argnums=(0, 1), has_aux=True)(
+            nets.critic, nets.mixer
+        )
+        flat = {"critic": self._flat("critic", gradients[0])}
+        if self.trains_mixer:
+            flat["mixer"] = self._flat("mixer", gradients[1])
+        report = [critic_losses, q.mean(0)]
+        if self._with_actors:
+            gradient, (_, actor_losses) = grad_and_value(actor_loss, has_aux=True)(nets.actor)
+            flat["actor"] = self._flat("actor", gradient)
+            report.append(actor_losses)
+        elif self.has_actors:
+            report.append(torch.zeros_like(critic_losses))
+        agents = len(self.config.team.agents)
+        return flat, torch.stack([values.expand(agents) for values in report])
 
-    @torch.no_grad()
-    def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One update: gradients, Adam, Polyak averaging.
+    def _flat(self, role: str, gradient: Params) -> Tensor:
+        """One role's gradient as a flat vector, clipped for every network on its own if so configured."""
+        limit, by = self.config.grad_clip, self.config.grad_clip_by
+        if limit is not None and by == "value":
+            gradient = {name: g.clamp(-limit, limit) for name, g in gradient.items()}
+        elif limit is not None:
+            squares = {name: g.flatten(1).square().sum(1) for name, g in gradient.items()}  # (rows,) each
+            if by == "global_norm":
+                squares = dict.fromkeys(squares, torch.stack(list(squares.values())).sum(0))
+            gradient = {
+                name: g * (limit / squares[name].sqrt().clamp(min=limit)).view(-1, *[1] * (g.dim() - 1))
+                for name, g in gradient.items()
+            }
+        return self._roles[role].flatten(gradient)
+
+    def gradients(self, columns: Columns, *, with_actors: bool | None = None) -> tuple[dict[str, Tensor], Tensor]:
+        """All roles' gradients of one minibatch as flat vectors, and the report; compiled if so configured.
 
         Args:
-            batch: The minibatch.
+            columns: The minibatch.
+            with_actors: Whether those of the actors, too; None if the algorithm has actors.
 
         Returns:
-            `critic_loss`, `actor_loss`, `q_mean` of every agent, `(N,)` each.
+            Gradients of "critic", "mixer" and "actor" (those that there are) and, for every agent, the critic's
+            loss, mean Q and the actor's loss, `(3, N)`; `(2, N)` if the algorithm has no actors.
         """
-        nets = Nets(self.actors.params, self.critics.params)
-        target = Nets(self.target_actors.params, self.target_critics.params)
-        actor_gradient, critic_gradient, report = self.gradients(nets, target, batch)
-        for role, stack, targets, gradient in (
-            ("critic", self.critics, self.target_critics, critic_gradient),
-            ("actor", self.actors, self.target_actors, actor_gradient),
-        ):
-            stack.flat.grad = gradient
-            self.get_optimizer(ALL_MODULES, role).step()
-            targets.flat.lerp_(stack.flat, self.config.tau)
+        nets, target = self.nets(), self.nets(target=True)
+        normalizer = {} if self.normalizers is None else self.normalizers.params
+        self._with_actors = self.has_actors if with_actors is None else with_actors
+        if not self.config.torch_compile_learner:
+            return self._gradients(nets, target, normalizer, columns)
+        key = (self.stage, self._with_actors)
+        if key not in self._compiled:
+            # Code of its own: compiled code is kept per code object, and what is not a tensor is not checked.
+            own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
+            mode = self.config.torch_compile_learner_dynamo_mode
+            self._compiled[key] = torch.compile(
+                MethodType(own, self),
+                fullgraph=True,
+                dynamic=False,
+                backend=self.config.torch_compile_learner_dynamo_backend,
+                mode=mode,
+                # Nothing but the tensors changes between calls, so nothing else need be checked at every one.
+                options=None if mode else {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
+            )
+        result: tuple[dict[str, Tensor], Tensor] = self._compiled[key](nets, target, normalizer, columns)
+        return result
+
+    def nets(self, *, target: bool = False) -> Nets:
+        """All roles' parameters, or those of their targets."""
+        stacks = self._targets if target else self._roles
+        return Nets(*(stacks[role].params if role in stacks else {} for role in Nets._fields))
+
+    @torch.no_grad()
+    def step(self, columns: Columns) -> Tensor:
+        """One update: gradients, Adam, Polyak averaging.
+
+        With `policy_delay` the actors and all targets take part in every so many updates only (TD3).
+
+        Args:
+            columns: The minibatch.
+
+        Returns:
+            The report of `gradients`.
+        """
+        whole = self._updates_lifetime % self.config.policy_delay == 0
+        gradients, report = self.gradients(columns, with_actors=whole and self.has_actors)
+        self._updates_lifetime += 1
+        self._whole_updates += whole
+        for role, stack in self._roles.items():
+            stack.flat.grad = gradients.get(role)  # Adam leaves alone what has none
+        for optimizer in ("critic", "actor") if "actor" in gradients else ("critic",):
+            self.get_optimizer(ALL_MODULES, optimizer).step()
+        if whole:
+            for role, stack in self._roles.items():
+                self._targets[role].flat.lerp_(stack.flat, self.config.tau)
         return report
 
     @override(Learner)
@@ -211,26 +466,31 @@ class JointLearner(TorchLearner):
         """One update for each of K minibatches, which the batch holds along its first axis.
 
         Args:
-            batch: A `Batch` with a further leading axis, `(K, B, ...)`.
+            batch: Columns with a further leading axis, `(K, B, ...)`.
             training_data: The same, wrapped by RLlib's LearnerGroup.
-            timesteps: RLlib's time, for learning-rate schedules.
+            timesteps: RLlib's time, for stages of training and learning-rate schedules.
             _no_metrics_reduce: Whether to go on collecting metrics instead of returning them.
             **kwargs: Ignored.
 
         Returns:
             Means over the updates since the last returned result, for every module, or None.
         """
-        batches: Batch = training_data.batch if training_data is not None else batch
-        self.before_gradient_based_update(timesteps=timesteps or {})
-        for index in range(len(batches.rewards)):
-            report = self.step(Batch(*(column[index] for column in batches)))
-            for name, value in report.items():
-                self._sums[name] = self._sums[name] + value if name in self._sums else value.clone()
-            self._updates += 1
+        columns: Columns = dict(training_data.batch if training_data is not None else batch)
+        timesteps = timesteps or {}
+        self.before_gradient_based_update(timesteps=timesteps)
+        self.stage = self.stage_at(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0))
+        if self._draw is not None:
+            actions = columns["actions"]
+            columns["noise"] = self._draw(actions.shape, generator=self._generator).to(actions.device)
+        updates = {name: column.unbind() for name, column in columns.items()}
+        count, size = columns["rewards"].shape[:2]
+        for index in range(count):
+            report = self.step({name: parts[index] for name, parts in updates.items()})
+            self._sum = report.clone() if self._sum is None else self._sum.add_(report)
+        self._updates += count
         self._weights_seq_no += 1
-        trained = batches.rewards.shape[0] * batches.rewards.shape[1]
-        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED), trained, reduce="sum")
-        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED_LIFETIME), trained, reduce="lifetime_sum")
+        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED), count * size, reduce="sum")
+        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED_LIFETIME), count * size, reduce="lifetime_sum")
         return None if _no_metrics_reduce else self.report(timesteps=timesteps)
 
     def report(self, *, timesteps: dict[str, Any] | None = None) -> Any:
@@ -242,15 +502,44 @@ class JointLearner(TorchLearner):
         Returns:
             RLlib's reduced metrics, or None if there was no update.
         """
-        if not self._updates:
+        if self._sum is None:
             return None
-        for name, total in self._sums.items():
-            for mid, value in zip(self.config.module_ids, (total / self._updates).tolist(), strict=True):
-                self.metrics.log_value((mid, name), value, window=1)
+        counts = {"critic_loss": self._updates, "q_mean": self._updates, "actor_loss": max(1, self._whole_updates)}
+        for (name, count), values in zip(counts.items(), self._sum.tolist(), strict=False):
+            by_module: dict[str, list[float]] = {}
+            for mid, value in zip(self.config.module_ids, values, strict=True):
+                by_module.setdefault(mid, []).append(value / count)
+            for mid, of_agents in by_module.items():
+                self.metrics.log_value((mid, name), sum(of_agents) / len(of_agents), window=1)
         self.metrics.log_value((ALL_MODULES, NUM_UPDATES_LIFETIME), self._updates, reduce="lifetime_sum")
-        self._sums, self._updates = {}, 0
+        self._sum, self._updates, self._whole_updates = None, 0, 0
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
+
+    def observe(self, observations: NDArray[np.float32]) -> None:
+        """Takes newly sampled observations `(..., N, O)` into the running normalisation, if there is one."""
+        if self.normalizers is None:
+            return
+        obs = torch.from_numpy(np.require(observations, np.float32, "W")).to(self._device)
+        params, rows = self.normalizers.params, torch.tensor(self.normalizers.rows)
+        for row in range(max(self.normalizers.rows) + 1):
+            own = obs[..., rows == row, :].flatten(0, -2)
+            merge(params["mean"][row], params["square"][row], params["count"][row], own)
+
+    @override(Learner)
+    def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """RLlib's state, the number of updates made and the random numbers to come."""
+        state: dict[str, Any] = super().get_state(*args, **kwargs)
+        state[_PROGRESS] = {"updates": self._updates_lifetime, "generator": self._generator.get_state().numpy()}
+        return state
+
+    @override(Learner)
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a saved state."""
+        super().set_state(state)
+        if _PROGRESS in state:
+            self._updates_lifetime = state[_PROGRESS]["updates"]
+            self._generator.set_state(torch.from_numpy(state[_PROGRESS]["generator"]))
 
     @override(TorchLearner)
     def _log_trainable_parameters(self) -> None:

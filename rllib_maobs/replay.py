@@ -23,7 +23,8 @@ class JointReplayBuffer(Checkpointable):
     observation is not stored a second time: each row links to its successor. An episode's true last
     observation gets a row of its own, without an action, so a truncated step bootstraps from what was really
     there and never from the observation after the reset. Rows of several environment copies lie mixed in
-    one ring; the links keep their episodes apart.
+    one ring; the links keep their episodes apart. Windows of several observations and returns of several steps
+    are not stored either: both are cut along the links when they are sampled.
 
     Args:
         capacity: Rows in the ring. An episode of T steps takes T + 1 of them.
@@ -67,6 +68,7 @@ class JointReplayBuffer(Checkpointable):
         # Rows are numbered for ever; row i lies at i % capacity and is there while i >= head - capacity.
         self._head = 0
         self._next = np.full(capacity, _NONE, dtype=np.int64)
+        self._previous = np.full(capacity, _NONE, dtype=np.int64)
         # The last row of each stream (one environment copy of one runner) and its position in the stream.
         self._tails: dict[tuple[str, int], tuple[int, int]] = {}
         self._rng = np.random.default_rng(seed)
@@ -78,7 +80,7 @@ class JointReplayBuffer(Checkpointable):
     @property
     def nbytes(self) -> int:
         """Bytes that the full ring takes."""
-        return sum(c.nbytes for c in self._columns.values()) + self._next.nbytes
+        return sum(c.nbytes for c in self._columns.values()) + self._next.nbytes + self._previous.nbytes
 
     def add(
         self,
@@ -124,15 +126,20 @@ class JointReplayBuffer(Checkpointable):
         following = np.full((length, copies), _NONE, dtype=np.int64)
         following[:-1] = row[1:]
         following[done] = last
+        previous = np.full((length, copies), _NONE, dtype=np.int64)
+        previous[1:] = np.where(done[:-1], _NONE, row[:-1])
         last_kept = self._head + steps + last.size - self.capacity
-        self._next[row % self.capacity] = following
-        self._next[last % self.capacity] = _NONE
         for copy in range(copies):
             tail, position = self._tails.get((source, copy), (_NONE, 0))
             alive = tail != _NONE and tail >= last_kept
             if alive and position == start:
                 self._next[tail % self.capacity] = row[0, copy]
+                previous[0, copy] = tail
             self._tails[source, copy] = (_NONE if done[-1, copy] else row[-1, copy], start + length)
+        self._next[row % self.capacity] = following
+        self._next[last % self.capacity] = _NONE
+        self._previous[row % self.capacity] = previous
+        self._previous[last % self.capacity] = row[done]
 
         self._write(row.reshape(-1), obs=obs, actions=actions, rewards=rewards, terminated=terminated[..., None])
         self._write(last, obs=final_obs)
@@ -156,42 +163,108 @@ class JointReplayBuffer(Checkpointable):
             column[first : first + split] = flat[:split]
             column[: rows.size - split] = flat[split:]
 
-    def sample(self, shape: Sequence[int]) -> dict[str, Tensor]:
+    def sample(self, shape: Sequence[int], *, gamma: float, n_step: int = 1, seq_length: int = 0) -> dict[str, Tensor]:
         """Draws transitions uniformly, with replacement.
+
+        A transition of n steps ends earlier where its episode does, or where nothing later is stored.
 
         Args:
             shape: Leading shape of the result, e.g. `(updates, batch)`.
+            gamma: Discount of one step.
+            n_step: n, steps from an observation to its next one.
+            seq_length: T, observations of a window up to each of both; 0 for no windows.
 
         Returns:
-            `obs` and `next_obs` `(*shape, N, O)`, `actions` `(*shape, N, A)`, `rewards` `(*shape, N)`,
-            `terminated` `(*shape, 1)` as 0.0 or 1.0 and, if stored, `state` and `next_state` `(*shape, S)`.
+            `obs` and `next_obs` `(*shape, N, O)`, `actions` `(*shape, N, A)`, the discounted `rewards` of the
+            steps `(*shape, N)`, the `discount` of the value after them `(*shape, 1)`: gamma^n, or 0.0 where
+            the episode terminated, and, if stored, `state` and `next_state` `(*shape, S)`. Windows are
+            `window` and `next_window` `(*shape, T, N, O)`, oldest first, in the place of `obs` and `next_obs`,
+            with `mask` and `next_mask` `(*shape, T)`: 0.0 before the episode's first observation.
 
         Raises:
             ValueError: If no complete transition is stored yet.
         """
-        rows = self._draw(int(np.prod(shape)))
-        following = self._next[rows]
-        here, there = (torch.from_numpy(i % self.capacity) for i in (rows, following))
-        batch = {name: self._take(name, here, shape) for name in self._columns}
-        batch["next_obs"] = self._take("obs", there, shape)
-        if "state" in self._columns:
-            batch["next_state"] = self._take("state", there, shape)
+        rows = self._draw(int(np.prod(shape)), seq_length)
+        rewards = self._columns["rewards"]
+        last, steps = rows, np.ones(rows.size)
+        total = rewards.index_select(0, self._places(rows))
+        for _ in range(n_step - 1):
+            ahead = self._next[last] % self.capacity
+            more = self._next[ahead] != _NONE
+            factor = torch.from_numpy(np.where(more, gamma**steps, 0.0).astype(np.float32)).to(rewards.device)
+            total += factor[:, None] * rewards.index_select(0, self._places(ahead))
+            last, steps = np.where(more, ahead, last), steps + more
+        following = self._next[last] % self.capacity
+        ended = self._columns["terminated"].index_select(0, self._places(last))
+        discount = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None] * (1.0 - ended)
+        batch = {
+            "actions": self._take("actions", rows, shape),
+            "rewards": total.view(*shape, -1),
+            "discount": discount.view(*shape, 1),
+        }
+        for prefix, places in (("", rows), ("next_", following)):
+            if seq_length:
+                window, mask, _ = self._windows(places, seq_length)
+                batch[f"{prefix}window"] = self._take("obs", window, (*shape, seq_length))
+                batch[f"{prefix}mask"] = torch.from_numpy(mask).to(rewards.device).view(*shape, seq_length)
+            else:
+                batch[f"{prefix}obs"] = self._take("obs", places, shape)
+            if "state" in self._columns:
+                batch[f"{prefix}state"] = self._take("state", places, shape)
         return batch
 
-    def _take(self, name: str, index: Tensor, shape: Sequence[int]) -> Tensor:
-        column = self._columns[name]
-        return column.index_select(0, index.to(column.device)).view(*shape, *column.shape[1:])
+    def _places(self, rows: NDArray[np.int64]) -> Tensor:
+        return torch.from_numpy(rows.reshape(-1)).to(self._columns["obs"].device)
 
-    def _draw(self, count: int) -> NDArray[np.int64]:
-        """Places of rows that have a successor, uniformly: the few others are drawn again."""
-        rows = self._rng.integers(len(self), size=count) if len(self) else np.empty(0, dtype=np.int64)
+    def _take(self, name: str, rows: NDArray[np.int64], shape: Sequence[int]) -> Tensor:
+        column = self._columns[name]
+        return column.index_select(0, self._places(rows)).view(*shape, *column.shape[1:])
+
+    def _draw(self, count: int, seq_length: int) -> NDArray[np.int64]:
+        """Places of rows that have a successor and a whole window, uniformly: the few others are drawn again."""
+        held = len(self)
+        rows = self._rng.integers(held, size=count) if held else np.empty(0, dtype=np.int64)
         missing = np.flatnonzero(self._next[rows] == _NONE)
-        if not len(self) or (missing.size == count and not (self._next[: len(self)] != _NONE).any()):
+        if not held or (missing.size == count and not (self._next[:held] != _NONE).any()):
             raise ValueError("The replay buffer holds no complete transition yet.")
+        missing = np.flatnonzero(self._unusable(rows, seq_length))
+        draws = 0
         while missing.size:
-            rows[missing] = self._rng.integers(len(self), size=missing.size)
-            missing = missing[self._next[rows[missing]] == _NONE]
+            rows[missing] = self._rng.integers(held, size=missing.size)
+            draws += 1
+            # In a ring of only a few rows there may be no window that its end has not cut: then any will do.
+            missing = missing[self._unusable(rows[missing], seq_length if draws < 100 else 0)]
         return rows
+
+    def _unusable(self, rows: NDArray[np.int64], seq_length: int) -> NDArray[np.bool_]:
+        """Which rows have no successor yet, or a window that the ring has partly overwritten."""
+        open_end: NDArray[np.bool_] = self._next[rows] == _NONE
+        if seq_length > 1 and self._head > self.capacity:
+            open_end |= self._windows(rows, seq_length)[2]
+        return open_end
+
+    def _windows(
+        self, rows: NDArray[np.int64], length: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.bool_]]:
+        """The places of the T rows up to each row, which of them are of its episode, and what was overwritten.
+
+        Returns:
+            Places `(rows, T)`, oldest first; mask `(rows, T)`; whether rows of the window are no longer there.
+        """
+        window = np.empty((rows.size, length), dtype=np.int64)
+        mask = np.empty((rows.size, length), dtype=np.float32)
+        valid, cut = np.ones((2, rows.size), dtype=np.bool_)
+        cut[:] = False
+        for step in reversed(range(length)):
+            window[:, step], mask[:, step] = rows, valid
+            if step == 0:
+                break
+            previous = self._previous[rows]
+            gone = valid & (previous != _NONE) & (previous < self._head - self.capacity)
+            cut |= gone
+            valid = valid & (previous != _NONE) & ~gone
+            rows = np.where(valid, previous % self.capacity, rows)
+        return window, mask, cut
 
     @override(Checkpointable)
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -200,6 +273,7 @@ class JointReplayBuffer(Checkpointable):
             **self._arguments,
             "columns": {name: column[: len(self)].cpu().numpy() for name, column in self._columns.items()},
             "next": self._next[: len(self)].copy(),
+            "previous": self._previous[: len(self)].copy(),
             "head": self._head,
             "tails": dict(self._tails),
             "rng": self._rng.bit_generator.state,
@@ -218,8 +292,9 @@ class JointReplayBuffer(Checkpointable):
         self._head = state["head"]
         for name, column in self._columns.items():
             column[: len(self)] = torch.from_numpy(state["columns"][name])
-        self._next[:] = _NONE
+        self._next[:] = self._previous[:] = _NONE
         self._next[: len(self)] = state["next"]
+        self._previous[: len(self)] = state["previous"]
         self._tails = dict(state["tails"])
         self._rng.bit_generator.state = state["rng"]
 

@@ -48,9 +48,9 @@ from ray.rllib.utils.metrics import (
 )
 from ray.tune.registry import ENV_CREATOR, _global_registry
 
-from rllib_maobs.envs.joint import JointEnv, Team, make_joint_env, register_envs, snapshot
-from rllib_maobs.modules.exploration import Exploration
-from rllib_maobs.modules.stack import Stack
+from rllib_maobs.envs.joint import JointEnv, Team, WithAgentIds, make_joint_env, register_envs, snapshot
+from rllib_maobs.modules import AgentModule, Stack
+from rllib_maobs.modules.agent import push
 
 EPISODE_METRICS = "episode_metrics"
 COMPONENT_SAMPLING = "sampling"
@@ -100,7 +100,8 @@ def env_creator(config: AlgorithmConfig) -> Any:
 def make_env(config: AlgorithmConfig, num_envs: int, worker_index: int = 0) -> JointEnv:
     """E copies of a config's environment, see `make_joint_env`."""
     context = EnvContext(config.env_config or {}, worker_index=worker_index, num_workers=config.num_env_runners)
-    return make_joint_env(env_creator(config), context, num_envs)
+    env = make_joint_env(env_creator(config), context, num_envs)
+    return WithAgentIds(env) if config.agent_id_input else env
 
 
 class JointEnvRunner(EnvRunner, Checkpointable):
@@ -149,22 +150,40 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         if self.env is not None:
             self.env.close()
         self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
-        spaces = self.team.action_space
-        self._low = spaces.low.astype(np.float32)
-        self._range = ((spaces.high - spaces.low) / 2.0).astype(np.float32)
         self._needs_reset = True
+        if self.team.discrete:
+            return
+        # (N, A): the lower bound, and half the range, of what an action in [-1, 1] stands for.
+        self._low, self._range = np.zeros((2, *self.team.action_mask.shape), dtype=np.float32)
+        for row, space in enumerate(self.team.action_spaces):
+            self._low[row, : space.shape[0]] = space.low
+            self._range[row, : space.shape[0]] = (space.high - space.low) / 2.0
 
     @override(EnvRunner)
     def make_module(self) -> None:
         """Builds the agents' modules and stacks their actors, so that all act in one call."""
         spec = self.config.get_multi_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
         self.module = spec.build()
-        self.actors = Stack([self.module[mid].actor for mid in self.module_ids])
-        self.exploration: Exploration = self.module[self.module_ids[0]].exploration
+        modules: list[AgentModule] = [self.module[mid] for mid in self.module_ids]
+        self.actors = Stack([module.acting for module in modules])
+        self.normalizers = (
+            Stack([module.normalizer for module in modules]) if self.config.normalize_observations else None
+        )
+        self._agent = modules[0]
+        # (N, A): where shorter actions are padded; None if none are.
+        self._padding = None if self.team.action_mask.all() else torch.from_numpy(~self.team.action_mask)
+        self._window: tuple[torch.Tensor, torch.Tensor] | None = None
+        if self._agent.seq_length:
+            # The modules' own state, of all agents: the last T observations (E, T, N, O) and which of them count.
+            shape = (self.num_envs, self._agent.seq_length)
+            window = torch.zeros(*shape, len(self.team.agents), self.team.observation_size)
+            self._window = window, torch.zeros(shape)
 
-    def share_actors(self, actors: Stack) -> None:
+    def share(self, actors: Stack, normalizers: Stack | None) -> None:
         """Acts with the tensors of a learner in this process from now on, so weights need no syncing."""
         self.actors.share(actors)
+        if self.normalizers is not None and normalizers is not None:
+            self.normalizers.share(normalizers)
 
     @override(EnvRunner)
     def sample(
@@ -232,6 +251,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._lengths[:] = 0
         self._started[:] = time.time()
         self._needs_reset = False
+        self._forget(np.ones(self.num_envs, dtype=np.bool_))
         self._steps_sampled += 1  # a gap: what follows is not linked to what was sampled before
 
     def _play(self, num_episodes: int, explore: bool, random_actions: bool) -> list[Any]:
@@ -249,7 +269,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         assert self.env is not None and self._obs is not None
         obs, state = self._obs, self._state()
         actions = self._act(obs, explore, random_actions)
-        self._obs, rewards, terminated, truncated, info = self.env.step(self._low + (actions + 1.0) * self._range)
+        played = actions.argmax(-1) if self.team.discrete else self._low + (actions + 1.0) * self._range
+        self._obs, rewards, terminated, truncated, info = self.env.step(played)
         self._lengths += 1
         self._check_finite("observation", self._obs)
         self._check_finite("reward", rewards)
@@ -264,6 +285,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             final_state = None if end is None else end[done]
             self._finish(done if counted is None else done & counted, info.get(EPISODE_METRICS, {}))
             self._returns[done], self._lengths[done], self._started[done] = 0.0, 0, time.time()
+            self._forget(done)
             self._obs, _ = self.env.reset(mask=done)
             self._check_finite("observation", self._obs)
         elif state is not None:
@@ -274,16 +296,45 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         assert self.env is not None
         return self.env.state("world") if self.team.state_size else None
 
+    def _forget(self, done: NDArray[np.bool_]) -> None:
+        """Empties the windows of the copies whose episodes are over."""
+        if self._window is not None:
+            for part in self._window:
+                part[torch.from_numpy(done)] = 0.0
+
     def _act(self, obs: NDArray[np.float32], explore: bool, random_actions: bool) -> NDArray[np.float32]:
-        """The agents' choices in [-1, 1], `(E, N, A)`."""
+        """The agents' choices `(E, N, A)`: in [-1, 1], or one-hot."""
+        seen: list[torch.Tensor] = [torch.from_numpy(obs)]
+        dims: list[int | None] = [1]
+        if self._window is not None:
+            self._window = push(*self._window, seen[0])
+            seen, dims = list(self._window), [2, None]
         if random_actions:
-            shape = (*obs.shape[:2], self.team.action_size)
-            return (torch.rand(shape, generator=self._generator) * 2.0 - 1.0).numpy()
+            uniform = torch.rand((*obs.shape[:2], self.team.action_size), generator=self._generator)
+            return self._encoded(self._padded(uniform).argmax(-1) if self.team.discrete else uniform * 2.0 - 1.0)
         with self.metrics.log_time(RLMODULE_INFERENCE_TIMER), torch.no_grad():
-            device = self.actors.flat.device
-            actions = self.actors(self.actors.params, (torch.from_numpy(obs).to(device), 1)).cpu()
+            seen = [part.to(self.actors.flat.device) for part in seen]
+            if self.normalizers is not None:
+                seen[0], dims[0] = self.normalizers(self.normalizers.params, (seen[0], dims[0])), 1
+            outputs = self._padded(self.actors(self.actors.params, *zip(seen, dims, strict=True)).cpu())
             if explore:
-                actions = self.exploration(actions, self.num_env_steps_sampled_lifetime, self._generator)
+                actions = self._agent.explore(outputs, self.num_env_steps_sampled_lifetime, self._generator)
+            else:
+                actions = self._agent.greedy(outputs)
+        return self._encoded(actions)
+
+    def _padded(self, outputs: torch.Tensor) -> torch.Tensor:
+        """The networks' outputs `(E, N, A)` with the value of no discrete action in the padding."""
+        if self._padding is None or not self.team.discrete:
+            return outputs
+        return outputs.masked_fill(self._padding, -torch.inf)
+
+    def _encoded(self, actions: torch.Tensor) -> NDArray[np.float32]:
+        """Actions as replay has them: one-hot if they are discrete, with zeros as padding if not."""
+        if self.team.discrete:
+            actions = torch.nn.functional.one_hot(actions, self.team.action_size).float()
+        elif self._padding is not None:
+            actions = actions.masked_fill(self._padding, 0.0)
         return actions.numpy()
 
     def _check_finite(self, what: str, values: NDArray[np.float32]) -> None:
@@ -367,13 +418,13 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     @override(EnvRunner)
     def get_spaces(self) -> dict[str, tuple[gym.Space[Any], gym.Space[Any]]]:
         """The spaces of every module, and under RLlib's own key those of every agent."""
-        observation, action = self.team.observation_space, self.team.action_space
+        team = self.team
         return {
             INPUT_ENV_SPACES: (
-                gym.spaces.Dict([(agent, observation) for agent in self.team.agents]),
-                gym.spaces.Dict([(agent, action) for agent in self.team.agents]),
+                gym.spaces.Dict(list(zip(team.agents, team.observation_spaces, strict=True))),
+                gym.spaces.Dict(list(zip(team.agents, team.action_spaces, strict=True))),
             ),
-            **{mid: (observation, action) for mid in self.module_ids},
+            **{mid: team.spaces(agent) for mid, agent in zip(self.module_ids, team.agents, strict=True)},
         }
 
     @override(EnvRunner)
@@ -450,6 +501,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
 _SAMPLING_STATE = (
     "_obs",
+    "_window",
     "_needs_reset",
     "_returns",
     "_lengths",

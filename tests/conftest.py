@@ -8,7 +8,7 @@ import ray
 import torch
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Batch, JointLearner
+from rllib_maobs.learner import Columns, JointLearner
 
 torch.set_num_threads(1)
 
@@ -24,50 +24,76 @@ def ray_session() -> Iterator[None]:
 
 
 def small_config(algorithm: str, **options: Any) -> maobs.JointConfig:
-    """An algorithm on spread-3a, small enough to build in a second; options are the environment's."""
+    """An algorithm on spread-3a, small enough to build in a second; options are the environment's.
+
+    Actions are of the first kind that the algorithm takes.
+    """
     config = maobs.ALGORITHMS[algorithm]()
+    if config.abilities.actions[0] == "discrete":
+        options = {"action_mode": "discrete", **options}
     config.environment("maobs/spread-3a", env_config=options)
     config.env_runners(num_envs_per_env_runner=2)
-    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000)
+    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000, seq_length=3)
     config.reporting(min_sample_timesteps_per_iteration=40)
     return config.debugging(seed=0)
 
 
-def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Batch:
-    """Random joint transitions for a validated config, some of them terminal."""
+def random_columns(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Columns:
+    """Random joint transitions for a validated config, some of them terminal, as replay would give them."""
     generator = torch.Generator().manual_seed(seed)
     team = config.team
-    n, o, a, s = len(team.agents), team.observation_size, team.action_size, config.state_size
+    n, o, a = len(team.agents), team.observation_size, team.action_size
+    legal = torch.from_numpy(team.action_mask)
+    present = torch.arange(o) < torch.tensor(team.observation_sizes)[:, None]  # (N, O)
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=generator)
 
-    return Batch(
-        obs=normal(size, n, o),
-        state=normal(size, s),
-        actions=torch.tanh(normal(size, n, a)),
-        rewards=normal(size, n),
-        terminated=(normal(size, 1) > 0.5).to(torch.get_default_dtype()),
-        next_obs=normal(size, n, o),
-        next_state=normal(size, s),
+    if team.discrete:
+        choice = normal(size, n, a).masked_fill(~legal, -torch.inf).argmax(-1)
+        actions = torch.nn.functional.one_hot(choice, a).to(torch.get_default_dtype())
+        noise = torch.rand((size, n, a), generator=generator)
+    else:
+        actions, noise = torch.tanh(normal(size, n, a)) * legal, normal(size, n, a)
+    team_reward = config.abilities.team_reward
+    columns = {
+        "actions": actions,
+        "rewards": normal(size, 1).expand(-1, n).clone() if team_reward else normal(size, n),
+        "discount": config.gamma**config.n_step * (normal(size, 1) < 0.5).to(torch.get_default_dtype()),
+        "noise": noise,
+    }
+    for prefix in ("", "next_"):
+        if config.actor == "lstm":
+            length = config.seq_length
+            columns[f"{prefix}window"] = normal(size, length, n, o) * present
+            # Windows of all lengths: what lies before the first observation is not empty, but does not count.
+            count = torch.randint(1, length + 1, (size, 1), generator=generator)
+            columns[f"{prefix}mask"] = (torch.arange(length) >= length - count).to(torch.get_default_dtype())
+        else:
+            columns[f"{prefix}obs"] = normal(size, n, o) * present
+        if config.critic_state == "world" and config.uses_state:
+            columns[f"{prefix}state"] = normal(size, config.state_size)
+    return columns
+
+
+def build_learner(config: maobs.JointConfig) -> JointLearner:
+    """The learner of a config, with targets that differ from the online networks."""
+    config.validate()
+    spaces = dict(zip(config.module_ids, map(config.team.spaces, config.team.agents), strict=True))
+    learner: JointLearner = config.learner_class(
+        config=config, module_spec=config.get_multi_rl_module_spec(spaces=spaces)
     )
+    learner.build()
+    generator = torch.Generator().manual_seed(1)
+    for mid in (*dict.fromkeys(config.module_ids), "mixer"):
+        if mid in learner.module:
+            for name, parameter in learner.module[mid].named_parameters():
+                if name.startswith("target_"):
+                    parameter.data.add_(0.01 * torch.randn(parameter.shape, generator=generator))
+    return learner
 
 
 @pytest.fixture
 def make_learner(ray_session: None) -> Callable[[maobs.JointConfig], JointLearner]:
-    """Builds the learner of a config, with targets that differ from the online networks."""
-
-    def make(config: maobs.JointConfig) -> JointLearner:
-        config.validate()
-        spaces = {mid: (config.team.observation_space, config.team.action_space) for mid in config.module_ids}
-        learner: JointLearner = config.learner_class(
-            config=config, module_spec=config.get_multi_rl_module_spec(spaces=spaces)
-        )
-        learner.build()
-        generator = torch.Generator().manual_seed(1)
-        for stack in (learner.target_actors, learner.target_critics):
-            noise = torch.randn(stack.flat.shape, generator=generator)
-            stack.flat.data.add_(0.01 * noise)
-        return learner
-
-    return make
+    """`build_learner`, with Ray started."""
+    return build_learner

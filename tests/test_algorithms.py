@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import ray
 import torch
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Discrete
 from mpe2 import simple_spread_v3
 from ray import tune
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Batch
+from rllib_maobs.learner import Columns
 from tests.conftest import ALGORITHMS, small_config
 from tests.test_runner import TwoAgents
 
@@ -33,9 +33,9 @@ def test_training_reports_what_rllib_users_look_for(ray_session: None, algorithm
         evaluation_config=maobs.JointConfig.overrides(env_config={"horizon": 20}, num_envs_per_env_runner=3),
     )
     algo = config.build_algo()
-    start = algo._learner.actors.flat.detach().clone()
+    start = algo._learner.acting.flat.detach().clone()
     result = algo.train()
-    assert not torch.equal(algo._learner.actors.flat, start)
+    assert not torch.equal(algo._learner.acting.flat, start)
     assert result["num_env_steps_sampled_lifetime"] == 40
     sampled, evaluated = result["env_runners"], result["evaluation"]["env_runners"]
     assert sampled["num_episodes"] == 4 and evaluated["num_episodes"] == 3
@@ -88,16 +88,22 @@ def test_a_restored_run_goes_on_exactly_as_the_first(ray_session: None, algorith
     algo.train()
     path = algo.save_to_path(tmp_path / "checkpoint")
     restored = Algorithm.from_checkpoint(path)
-    assert restored._learner.actors.flat.data_ptr() == restored.env_runner.actors.flat.data_ptr()
+    assert restored._learner.acting.flat.data_ptr() == restored.env_runner.actors.flat.data_ptr()
     for _ in range(2):
         first, second = algo.train(), restored.train()
-        assert torch.equal(algo._learner.actors.flat, restored._learner.actors.flat)
-        assert torch.equal(algo._learner.target_critics.flat, restored._learner.target_critics.flat)
+        for stacks, others in (
+            (algo._learner._roles, restored._learner._roles),
+            (algo._learner._targets, restored._learner._targets),
+        ):
+            for role, stack in stacks.items():
+                assert torch.equal(stack.flat, others[role].flat)
         assert first["env_runners"]["episode_return_mean"] == second["env_runners"]["episode_return_mean"]
         assert first["num_env_steps_sampled_lifetime"] == second["num_env_steps_sampled_lifetime"]
     obs = np.random.default_rng(0).normal(size=(4, 18)).astype(np.float32)
     for agent in algo.config.module_ids:
-        a, b = (x.get_module(agent).forward_inference({"obs": obs})["actions"] for x in (algo, restored))
+        start = algo.get_module(agent).get_initial_state()
+        batch = {"obs": obs, "state_in": {k: v.expand(4, *v.shape) for k, v in start.items()}}
+        a, b = (x.get_module(agent).forward_inference(batch)["actions"] for x in (algo, restored))
         assert torch.equal(a, b)
     algo.stop()
     restored.stop()
@@ -140,7 +146,7 @@ def test_remote_runners_sample_learn_and_survive_a_kill(ray_session: None) -> No
     (weights,) = algo.env_runner_group.foreach_env_runner(
         lambda r: r.actors.flat.detach().clone(), local_env_runner=False
     )
-    assert torch.equal(weights, algo._learner.actors.flat)
+    assert torch.equal(weights, algo._learner.acting.flat)
     (actor,) = algo.env_runner_group._worker_manager.actors().values()
     ray.kill(actor, no_restart=False)
     steps = updates = 0
@@ -184,10 +190,16 @@ def test_names_survive_a_restart_of_ray(ray_session: None, tmp_path: Path) -> No
     assert results[0].metrics["num_env_steps_sampled_lifetime"] == 80
 
 
-class DiscreteAgents(TwoAgents):
+class MixedAgents(TwoAgents):
     def __init__(self, config: dict[str, Any]) -> None:
         super().__init__(config)
-        self.action_spaces = dict.fromkeys(self.agents, Discrete(5))
+        self.action_spaces["right"] = Discrete(5)
+
+
+class PictureAgents(TwoAgents):
+    def __init__(self, config: dict[str, Any]) -> None:
+        super().__init__(config)
+        self.observation_spaces = dict.fromkeys(self.agents, Box(0.0, 1.0, (4, 4), np.float32))
 
 
 @pytest.mark.parametrize(
@@ -204,20 +216,38 @@ class DiscreteAgents(TwoAgents):
         (lambda c: c.training(critic_state="all"), r"critic_state must be one of 'observations', 'world', not 'all'"),
         (lambda c: c.training(other_agents_actions="mine"), r"must be one of 'replay', 'current', 'joint', not 'mine'"),
         (lambda c: c.training(exploration={"eps": 0.1}), r"Unknown exploration setting 'eps'; legal are"),
-        (lambda c: c.training(grad_clip=1.0), r"grad_clip must be None"),
+        (lambda c: c.training(grad_clip=0.0), r"grad_clip must be a finite number in \(0, inf\), not 0.0"),
+        (lambda c: c.training(grad_clip_by="max"), r"grad_clip_by` \(max\) must be one of"),
+        (lambda c: c.training(actor="gru"), r"actor must be one of 'mlp', 'lstm', not 'gru'"),
+        (lambda c: c.training(seq_length=0), r"seq_length must be a finite number in \[1, inf\), not 0"),
+        (lambda c: c.training(seq_length=2.5), r"seq_length must be an integer, not 2.5"),
+        (lambda c: c.training(n_step=0), r"n_step must be a finite number in \[1, inf\)"),
+        (lambda c: c.training(policy_delay=0), r"policy_delay must be a finite number in \[1, inf\)"),
+        (lambda c: c.training(gumbel_temperature=0.0), r"gumbel_temperature must be a finite number in \(0, inf\)"),
+        (lambda c: c.training(reward_scale=float("nan")), r"reward_scale must be a finite number"),
         (lambda c: c.rl_module(model_config={"activation": "step"}), r"activation'\] must be one of 'relu', 'tanh'"),
         (lambda c: c.rl_module(model_config={"hidden_sizes": ()}), r"hidden_sizes'\] must be positive integers"),
         (lambda c: c.rl_module(model_config={"hiden": (8,)}), r"Unknown model_config setting 'hiden'; legal are"),
         (lambda c: c.learners(num_learners=1), r"num_learners must be 0, not 1"),
-        (lambda c: c.multi_agent(policies={"all"}, policy_mapping_fn=lambda a, e, **k: "all"), r"policy of its own"),
+        (
+            lambda c: c.multi_agent(policies={"all", "none"}, policy_mapping_fn=lambda a, e, **k: "all"),
+            r"must use every policy and no other: policies are \['all', 'none'\]",
+        ),
+        (
+            lambda c: c.environment(TwoAgents, env_config={"sizes": (3, 4)}).multi_agent(
+                policies={"all"}, policy_mapping_fn=lambda a, e, **k: "all"
+            ),
+            r"share policy 'all' must have spaces of equal size, not {'left': ",
+        ),
+        (lambda c: c.multi_agent(policies_to_train=["agent_0"]), r"policies_to_train must be None"),
         (
             lambda c: c.environment("maobs/spread-4a"),
             r"Unknown environment 'maobs/spread-4a'; legal are maobs/.*, maobs/spread-3a",
         ),
         (lambda c: c.environment(None), r"No environment: set one with"),
         (lambda c: c.environment(env_config={"num_agnts": 4}), r"num_agnts.*num_agents"),
-        (lambda c: c.environment(TwoAgents, env_config={"sizes": (3, 4)}), r"'left' has 3 and 'right' has 4"),
-        (lambda c: c.environment(DiscreteAgents), r"action space of agent 'left' is Discrete\(5\); legal are"),
+        (lambda c: c.environment(MixedAgents), r"'left' and 'right' must both be Box or both Discrete"),
+        (lambda c: c.environment(PictureAgents), r"observation space of agent 'left' is Box.*flatten it"),
         (lambda c: c.environment(TwoAgents).training(critic_state="world"), r'use critic_state="observations"'),
     ],
 )
@@ -228,7 +258,7 @@ def test_wrong_settings_are_refused_before_anything_starts(ray_session: None, ch
         config.build_algo()
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", ["iddpg", "maddpg", "maddpg-l"])
 def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) -> None:
     """The critic's input widths, for both kinds of state, are those of the family table."""
     widths = {
@@ -240,15 +270,13 @@ def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) 
         algo = small_config(algorithm).training(critic_state=kind).build_algo()
         critic = algo._learner.module["agent_0"].critic
         assert (critic.from_state.in_features, critic.from_action.in_features) == want
-        seen: list[Batch] = []
-        algo._learner.step = lambda batch, seen=seen: seen.append(batch) or {}
+        seen: list[Columns] = []
+        algo._learner.step = lambda columns, seen=seen: seen.append(columns) or torch.zeros(3, 3)
         algo.train()
-        state = seen[0].state
-        if algorithm != "iddpg":
-            assert state.shape[-1] == want[0]
-        positions = seen[0].obs[..., 2:4].flatten(1)
+        batch = algo._learner.prepare(seen[0], {})
         if kind == "world" and algorithm != "iddpg":
-            torch.testing.assert_close(state[:, :6], positions)
-        elif kind == "observations":
-            torch.testing.assert_close(state, seen[0].obs.flatten(1))
+            assert batch.state.shape[-1] == want[0]
+            torch.testing.assert_close(batch.state[:, :6], batch.obs[..., 2:4].flatten(1))
+        else:
+            torch.testing.assert_close(batch.state, batch.obs.flatten(1))
         algo.stop()

@@ -9,6 +9,7 @@ import torch
 from rllib_maobs.replay import JointReplayBuffer
 
 N, O, A, S = 3, 4, 2, 5  # noqa: E741
+G = 0.9
 
 
 class Simulator:
@@ -62,7 +63,7 @@ def check(batch: dict[str, torch.Tensor], copies: int, length: int = 3) -> None:
     torch.testing.assert_close(batch["actions"], batch["obs"][:, :, :1] + torch.arange(A) / 100)
     torch.testing.assert_close(batch["rewards"], -batch["obs"][:, :, 0])
     over = t + 1 == length + copy
-    assert torch.equal(batch["terminated"][:, 0], (over & (episode % 2 == 0)).float())
+    assert torch.equal(batch["discount"][:, 0], G * (~(over & (episode % 2 == 0))).float())
     assert copy.max() < copies
 
 
@@ -75,7 +76,7 @@ def test_transitions_never_mix_episodes_copies_or_agents(copies: int, fragment: 
     for _ in range(60 // fragment):
         buffer.add(**simulator.fragment(fragment))
     for _ in range(30):
-        batch = buffer.sample((256,))
+        batch = buffer.sample((256,), gamma=G)
         check(batch, copies)
         seen |= set(batch["obs"][:, 0, 0].round().long().tolist())
     # All steps are drawn but the last ones, whose next observation is not there yet.
@@ -88,14 +89,14 @@ def test_the_newest_step_waits_for_its_next_observation() -> None:
     simulator = Simulator(1)
     buffer.add(**simulator.fragment(1))
     with pytest.raises(ValueError, match="no complete transition"):
-        buffer.sample((4,))
+        buffer.sample((4,), gamma=G)
     buffer.add(**simulator.fragment(1))
-    assert set(buffer.sample((50,))["obs"][:, 0, 0].tolist()) == {0.0}
+    assert set(buffer.sample((50,), gamma=G)["obs"][:, 0, 0].tolist()) == {0.0}
 
 
 def test_an_empty_buffer_cannot_be_sampled() -> None:
     with pytest.raises(ValueError, match="no complete transition"):
-        JointReplayBuffer(10, N, O, A).sample((4,))
+        JointReplayBuffer(10, N, O, A).sample((4,), gamma=G)
 
 
 @pytest.mark.parametrize("capacity", [23, 40, 64])
@@ -108,7 +109,7 @@ def test_old_rows_give_way_and_what_is_left_stays_true(capacity: int) -> None:
         buffer.add(**fragment)
         written += [*fragment["obs"][..., 0, 0].ravel().tolist(), *fragment["final_obs"][:, 0, 0].tolist()]
         if len(buffer) > 10:
-            batch = buffer.sample((64,))
+            batch = buffer.sample((64,), gamma=G)
             check(batch, 3)
             assert set(batch["obs"][:, 0, 0].tolist()) <= set(written[-capacity:])
     assert len(buffer) == capacity
@@ -119,7 +120,7 @@ def test_a_fragment_that_fills_the_ring_leaves_no_link_to_what_it_replaced() -> 
     simulator = Simulator(2, length=50)
     for _ in range(3):
         buffer.add(**simulator.fragment(4))
-        check(buffer.sample((100,)), 2, length=50)
+        check(buffer.sample((100,), gamma=G), 2, length=50)
 
 
 def test_a_lost_fragment_is_not_bridged() -> None:
@@ -132,7 +133,7 @@ def test_a_lost_fragment_is_not_bridged() -> None:
     restarted = Simulator(2, source="other", length=50)
     restarted.episode += 7
     buffer.add(**restarted.fragment(4))
-    batch = buffer.sample((500,))
+    batch = buffer.sample((500,), gamma=G)
     check(batch, 2, length=50)
     assert {3, 10} & set((batch["obs"][:, 0, 0] % 10_000).long().tolist()) == set()
 
@@ -144,7 +145,70 @@ def test_two_runners_interleave() -> None:
     for _ in range(10):
         buffer.add(**first.fragment(3))
         buffer.add(**second.fragment(3))
-    check(buffer.sample((500,)), 2, length=9)
+    check(buffer.sample((500,), gamma=G), 2, length=9)
+
+
+@pytest.mark.parametrize("capacity", [50, 1000])
+@pytest.mark.parametrize("fragment", [1, 2, 7])
+@pytest.mark.parametrize("length", [1, 3, 6])
+def test_windows_are_the_last_observations_of_the_same_episode(capacity: int, fragment: int, length: int) -> None:
+    """They end at t and t + 1, are short at an episode's start, and whole whatever the ring has overwritten."""
+    buffer = JointReplayBuffer(capacity, N, O, A, seed=0)
+    simulator = Simulator(3, length=5)
+    for _ in range(140 // fragment):
+        buffer.add(**simulator.fragment(fragment))
+    batch = buffer.sample((4, 64), gamma=G, seq_length=length)
+    assert batch["window"].shape == batch["next_window"].shape == (4, 64, length, N, O)
+    now = batch["window"][:, :, -1]
+    torch.testing.assert_close(batch["next_window"][:, :, -1], now + 1)
+    torch.testing.assert_close(batch["actions"], now[..., :1] + torch.arange(A) / 100)
+    t = now[..., 0, 0].round().long() % 100
+    for name, newest in (("", t), ("next_", t + 1)):
+        ago = torch.arange(length).flip(0)
+        counts = ago <= newest[..., None]
+        assert torch.equal(batch[f"{name}mask"], counts.float())
+        want = batch[f"{name}window"][:, :, -1:] - ago[:, None, None]
+        torch.testing.assert_close(batch[f"{name}window"][counts], want[counts])
+        assert batch[f"{name}window"].isfinite().all()
+
+
+@pytest.mark.parametrize("fragment", [1, 5])
+def test_windows_do_not_bridge_a_gap(fragment: int) -> None:
+    buffer = JointReplayBuffer(1000, N, O, A, seed=0)
+    simulator = Simulator(1, length=50)
+    for _ in range(10 // fragment):
+        buffer.add(**simulator.fragment(fragment))
+    simulator.fragment(3)  # sampled but never arrived
+    for _ in range(10 // fragment):
+        buffer.add(**simulator.fragment(fragment))
+    batch = buffer.sample((500,), gamma=G, seq_length=4)
+    t = batch["window"][:, -1, 0, 0].round().long()
+    since = torch.where(t < 13, t, t - 13)
+    assert torch.equal(batch["mask"].sum(1).long(), (since + 1).clamp(max=4))
+
+
+@pytest.mark.parametrize("fragment", [1, 7])
+def test_returns_of_n_steps_end_with_the_episode(fragment: int) -> None:
+    """Rewards of up to three steps, discounted; the next observation and its discount belong to the last of them."""
+    buffer = JointReplayBuffer(1000, N, O, A, S, seed=0)
+    simulator = Simulator(2, length=4)
+    for _ in range(42 // fragment):
+        buffer.add(**simulator.fragment(fragment, state=True))
+    batch = buffer.sample((500,), gamma=G, n_step=3, seq_length=2)
+    code = batch["window"][:, -1, 0, 0].round().long()
+    copy, episode, t = code // 10_000, code // 100 % 100, code % 100
+    # At the newest end of the ring there may be fewer steps than three.
+    steps = (batch["next_window"][:, -1, 0, 0] - batch["window"][:, -1, 0, 0]).round().long()
+    left = 4 + copy - t
+    newest = episode == torch.from_numpy(simulator.episode)[copy]
+    assert torch.equal(steps[~newest], left.clamp(max=3)[~newest])
+    assert (steps[newest] <= 3).all() and (steps >= 1).all()
+    own = batch["window"][:, -1, :, 0]
+    want = sum(-(own + k) * (G**k * (k < steps))[:, None] for k in range(3))
+    torch.testing.assert_close(batch["rewards"], want, rtol=1e-5, atol=1e-2)
+    over = (steps == left) & (episode % 2 == 0)
+    torch.testing.assert_close(batch["discount"][:, 0], torch.where(over, 0.0, G ** steps.float()))
+    torch.testing.assert_close(batch["next_state"][:, 0], batch["next_window"][:, -1, 0, 0])
 
 
 def test_stored_states_go_with_their_observations() -> None:
@@ -152,7 +216,7 @@ def test_stored_states_go_with_their_observations() -> None:
     simulator = Simulator(2)
     for _ in range(10):
         buffer.add(**simulator.fragment(3, state=True))
-    batch = buffer.sample((8, 16))
+    batch = buffer.sample((8, 16), gamma=G)
     assert batch["state"].shape == (8, 16, S)
     assert torch.equal(batch["state"][..., 0], batch["obs"][..., 0, 0])
     assert torch.equal(batch["next_state"][..., 0], batch["next_obs"][..., 0, 0])
@@ -161,7 +225,7 @@ def test_stored_states_go_with_their_observations() -> None:
 def test_sampling_is_uniform() -> None:
     buffer = JointReplayBuffer(50, N, O, A, seed=0)
     buffer.add(**Simulator(1, length=40).fragment(41))
-    counts = np.bincount(buffer.sample((40_000,))["obs"][:, 0, 0].long().numpy(), minlength=40)
+    counts = np.bincount(buffer.sample((40_000,), gamma=G)["obs"][:, 0, 0].long().numpy(), minlength=40)
     assert counts.size == 40
     assert np.abs(counts - 1000).max() < 5 * np.sqrt(1000)
 
@@ -176,7 +240,7 @@ def test_a_restored_buffer_goes_on_as_the_first() -> None:
     more = simulator.fragment(3)
     for b in (buffer, restored):
         b.add(**more)
-    first, second = buffer.sample((100,)), restored.sample((100,))
+    first, second = buffer.sample((100,), gamma=G), restored.sample((100,), gamma=G)
     assert all(torch.equal(first[k], second[k]) for k in first)
     with pytest.raises(ValueError, match="'capacity': 64"):
         JointReplayBuffer(65, N, O, A).set_state(buffer.get_state())

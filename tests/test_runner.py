@@ -26,7 +26,10 @@ class TwoAgents(MultiAgentEnv):
         self.observation_spaces = {
             a: gym.spaces.Box(-np.inf, np.inf, (n,), np.float32) for a, n in zip(self.agents, sizes, strict=True)
         }
-        self.action_spaces = dict.fromkeys(self.agents, gym.spaces.Box(2.0, 6.0, (2,), np.float32))
+        lengths = self.config.get("lengths", (2, 2))
+        self.action_spaces = {
+            a: gym.spaces.Box(2.0, 6.0, (n,), np.float32) for a, n in zip(self.agents, lengths, strict=True)
+        }
         self.t = 0
 
     def _obs(self) -> dict:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self
 
-import torch
 from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm, JointConfig, one_of
 from rllib_maobs.learner import Batch, JointLearner, Nets
-from rllib_maobs.modules import Params
 
 OTHER_AGENTS_ACTIONS = ("replay", "current", "joint")
 
@@ -20,27 +18,24 @@ class MADDPGLearner(JointLearner):
     """Equations 2 and 3."""
 
     @override(JointLearner)
-    def critic_loss(self, critic: Params, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Eq. 2: L(phi_a) = E[(y_a - Q_a(s, u_1..u_N))^2], y_a = r_a + gamma Q'_a(s', mu'_1(o'_1)..mu'_N(o'_N))."""
-        next_actions = self.act(target.actor, batch.next_obs).flatten(1)  # (B, N * A)
-        next_q = self.q(target.critic, self.encode(target.critic, batch.next_state), next_actions)  # (B, N)
-        y = batch.rewards + self.config.gamma * (1.0 - batch.terminated) * next_q  # (B, N)
-        encoded = self.encode(critic, batch.state)  # (B, N, H)
-        q = self.q(critic, encoded, batch.actions.flatten(1))  # (B, N)
-        return (y - q).square().mean(0), q, encoded
+        next_actions = self.next_actions(target.actor, batch).flatten(1)  # (B, N * A)
+        next_q = self.q(target.critic, self.encode(target.critic, batch.next_state), next_actions).amin(-1)  # (B, N)
+        y = batch.rewards + batch.discount * next_q  # (B, N)
+        encoded = self.encode(nets.critic, batch.state)  # (B, N, H)
+        q = self.q(nets.critic, encoded, batch.actions.flatten(1))  # (B, N, C)
+        return self.squared_error(y, q), q[..., 0], encoded
 
     @override(JointLearner)
-    def actor_loss(self, actor: Params, critic: Params, encoded: Tensor, batch: Batch) -> Tensor:
+    def actor_loss(self, actions: Tensor, nets: Nets, encoded: Tensor, batch: Batch) -> Tensor:
         """Eq. 3: grad J(mu_a) = E[grad mu_a(o_a) grad_{u_a} Q_a(s, u_1..u_N) at u_a = mu_a(o_a)], as a loss."""
-        actions = self.act(actor, batch.obs)  # (B, N, A)
         others = self.config.other_agents_actions
         if others == "joint":
-            return -self.q(critic, encoded, actions.flatten(1)).mean(0)  # (N,)
+            return -self.q(nets.critic, encoded, actions.flatten(1))[..., 0].mean(0)  # (N,)
         fixed = batch.actions if others == "replay" else actions.detach()
-        own = torch.eye(actions.shape[1], device=actions.device)[:, :, None]  # (N, N, 1)
-        # Critic a sees agent a's current action and, at the others' places, theirs as they are fixed.
-        seen = own * actions[:, None] + (1.0 - own) * fixed[:, None]  # (B, N, N, A)
-        return -self.q(critic, encoded, seen.flatten(2)).mean(0)  # (N,)
+        own = self.own_actions(actions, fixed)  # (B, N, N, A): critic a sees a's current action among the fixed ones
+        return -self.q(nets.critic, encoded, own.flatten(2))[..., 0].mean(0)  # (N,)
 
 
 class MADDPGConfig(JointConfig):
@@ -65,7 +60,9 @@ class MADDPGConfig(JointConfig):
         self.other_agents_actions: Literal["replay", "current", "joint"] = "replay"
 
     @override(JointConfig)
-    def training(self, *, other_agents_actions: Any = NotProvided, **kwargs: Any) -> Self:
+    def training(
+        self, *, other_agents_actions: Literal["replay", "current", "joint"] = NotProvided, **kwargs: Any
+    ) -> Self:
         """Sets the training settings.
 
         Args:
@@ -84,7 +81,7 @@ class MADDPGConfig(JointConfig):
         super().validate()
 
     @override(JointConfig)
-    def critic_sizes(self) -> tuple[int, int]:
+    def critic_sizes(self, agent: str) -> tuple[int, int]:
         """(S, N * A)."""
         return self.state_size, len(self.team.agents) * self.team.action_size
 

@@ -7,26 +7,25 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm, JointConfig
 from rllib_maobs.learner import Batch, JointLearner, Nets
-from rllib_maobs.modules import Params
 
 
 class MADDPGLLearner(JointLearner):
     """Equations 11 and 12."""
 
     @override(JointLearner)
-    def critic_loss(self, critic: Params, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Eq. 11: L(phi_a) = E[(y_a - Q_a(s, u_a))^2], y_a = r_a + gamma Q'_a(s', mu'_a(o'_a))."""
-        next_actions = self.act(target.actor, batch.next_obs)  # (B, N, A)
-        next_q = self.q(target.critic, self.encode(target.critic, batch.next_state), next_actions)  # (B, N)
-        y = batch.rewards + self.config.gamma * (1.0 - batch.terminated) * next_q  # (B, N)
-        encoded = self.encode(critic, batch.state)  # (B, N, H)
-        q = self.q(critic, encoded, batch.actions)  # (B, N)
-        return (y - q).square().mean(0), q, encoded
+        next_actions = self.next_actions(target.actor, batch)  # (B, N, A)
+        next_q = self.q(target.critic, self.encode(target.critic, batch.next_state), next_actions).amin(-1)  # (B, N)
+        y = batch.rewards + batch.discount * next_q  # (B, N)
+        encoded = self.encode(nets.critic, batch.state)  # (B, N, H)
+        q = self.q(nets.critic, encoded, batch.actions)  # (B, N, C)
+        return self.squared_error(y, q), q[..., 0], encoded
 
     @override(JointLearner)
-    def actor_loss(self, actor: Params, critic: Params, encoded: Tensor, batch: Batch) -> Tensor:
+    def actor_loss(self, actions: Tensor, nets: Nets, encoded: Tensor, batch: Batch) -> Tensor:
         """Eq. 12: grad J(mu_a) = E[grad mu_a(o_a) grad_u Q_a(s, u) at u = mu_a(o_a)], as a loss."""
-        return -self.q(critic, encoded, self.act(actor, batch.obs)).mean(0)  # (N,)
+        return -self.q(nets.critic, encoded, actions)[..., 0].mean(0)  # (N,)
 
 
 class MADDPGLConfig(JointConfig):
@@ -49,7 +48,7 @@ class MADDPGLConfig(JointConfig):
         super().__init__(algo_class=algo_class or MADDPGL)
 
     @override(JointConfig)
-    def critic_sizes(self) -> tuple[int, int]:
+    def critic_sizes(self, agent: str) -> tuple[int, int]:
         """(S, A)."""
         return self.state_size, self.team.action_size
 

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces import flatdim
 from numpy.typing import NDArray
 from ray.tune.registry import register_env
 
@@ -24,6 +25,8 @@ from rllib_maobs.envs.rllib_env import MAObsEnv
 Float = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 StepResult = tuple[Float, Float, Bool, Bool, dict[str, Any]]
+# Of rewards that are called equal, relative to their size: sums taken in another order differ.
+REWARD_TOLERANCE = 1e-5
 
 
 class JointEnv(Protocol):
@@ -38,7 +41,10 @@ class JointEnv(Protocol):
         """Resets all copies (or those of `mask`) and returns all observations `(E, N, O)`."""
 
     def step(self, actions: Float) -> StepResult:
-        """Steps all copies by `(E, N, A)`: observations, rewards `(E, N)`, terminated, truncated `(E,)`, info."""
+        """Steps all copies by `(E, N, A)`, or by the numbers `(E, N)` of discrete actions.
+
+        Returns observations, rewards `(E, N)`, terminated, truncated `(E,)`, info.
+        """
 
     def state(self, kind: str | None = None) -> Float:
         """The state `(E, S)`."""
@@ -51,27 +57,58 @@ class JointEnv(Protocol):
 class Team:
     """What the learning side must know of an environment.
 
+    Agents may differ: shorter observations and actions are padded with zeros at their ends, so that all agents'
+    fit into arrays `(..., N, O)` and `(..., N, A)`. A discrete action is a one-hot vector in those arrays.
+
     Attributes:
         agents: Agent ids in the environment's order: the order of every N axis.
-        observation_space: Every agent's observation space.
-        action_space: Every agent's action space.
-        state_size: S of `state("world")`, 0 if the environment has none.
+        observation_spaces: Every agent's observation space.
+        action_spaces: Every agent's action space: all bounded vectors, or all Discrete.
+        state_size: S of `state("world")`, 0 if it was not asked for.
     """
 
     agents: tuple[str, ...]
-    observation_space: gym.spaces.Box
-    action_space: gym.spaces.Box
+    observation_spaces: tuple[gym.spaces.Box, ...]
+    action_spaces: tuple[gym.spaces.Box, ...] | tuple[gym.spaces.Discrete, ...]
     state_size: int
 
     @property
+    def observation_sizes(self) -> tuple[int, ...]:
+        """Length of every agent's own observation."""
+        return tuple(int(space.shape[0]) for space in self.observation_spaces)
+
+    @property
     def observation_size(self) -> int:
-        """O."""
-        return int(self.observation_space.shape[0])
+        """O, that of the longest."""
+        return max(self.observation_sizes)
+
+    @property
+    def action_sizes(self) -> tuple[int, ...]:
+        """Length of every agent's own action, or the number of its discrete actions."""
+        return tuple(
+            int(space.n) if isinstance(space, gym.spaces.Discrete) else int(space.shape[0])
+            for space in self.action_spaces
+        )
 
     @property
     def action_size(self) -> int:
-        """A."""
-        return int(self.action_space.shape[0])
+        """A, that of the longest."""
+        return max(self.action_sizes)
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are discrete."""
+        return isinstance(self.action_spaces[0], gym.spaces.Discrete)
+
+    @property
+    def action_mask(self) -> Bool:
+        """What of the padded actions is not padding, `(N, A)`."""
+        return np.arange(self.action_size) < np.array(self.action_sizes)[:, None]
+
+    def spaces(self, agent: str) -> tuple[gym.spaces.Box, gym.spaces.Space[Any]]:
+        """One agent's spaces."""
+        index = self.agents.index(agent)
+        return self.observation_spaces[index], self.action_spaces[index]
 
     @classmethod
     def of(cls, env: JointEnv, *, with_state: bool) -> Team:
@@ -82,34 +119,101 @@ class Team:
             with_state: Whether its own state is needed (`critic_state="world"`); then it is reset once.
 
         Raises:
-            ValueError: If its team cannot be trained with one network shape: agents whose spaces differ, or
-                spaces that are not bounded vectors; says which and what is legal.
+            ValueError: If spaces are not vectors, or actions unbounded or of both kinds; says which and what is legal.
         """
         agents = tuple(env.agents)
-        for what, spaces in (("observation", env.observation_spaces), ("action", env.action_spaces)):
-            first = spaces[agents[0]]
-            for agent in agents:
-                space = spaces[agent]
-                if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-                    raise ValueError(
-                        f"The {what} space of agent {agent!r} is {space}; legal are one-dimensional Box spaces "
-                        f"(flatten it, or choose continuous actions in the environment's options)."
-                    )
-                if space.shape != first.shape:
-                    raise ValueError(
-                        f"Agents must have {what}s of equal size, but {agents[0]!r} has {first.shape[0]} and "
-                        f"{agent!r} has {space.shape[0]}: pad the smaller ones in the environment."
-                    )
-                if what == "action" and not space.is_bounded("both"):
-                    raise ValueError(
-                        f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs "
-                        f"finite bounds to scale to."
-                    )
+        for agent in agents:
+            space = env.observation_spaces[agent]
+            if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+                raise ValueError(
+                    f"The observation space of agent {agent!r} is {space}; legal are one-dimensional Box spaces: "
+                    f"flatten it in the environment."
+                )
+        actions = tuple(env.action_spaces[agent] for agent in agents)
+        for agent, space in zip(agents, actions, strict=True):
+            box = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+            if not box and not isinstance(space, gym.spaces.Discrete):
+                raise ValueError(
+                    f"The action space of agent {agent!r} is {space}; legal are Box of one dimension and Discrete."
+                )
+            if type(space) is not type(actions[0]):
+                raise ValueError(
+                    f"The actions of agents {agents[0]!r} and {agent!r} must both be Box or both Discrete, but are "
+                    f"{actions[0]} and {space}."
+                )
+            if isinstance(space, gym.spaces.Box) and not space.is_bounded("both"):
+                raise ValueError(
+                    f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs "
+                    f"finite bounds to scale to."
+                )
         state_size = 0
         if with_state:
             env.reset()
             state_size = int(env.state("world").shape[-1])
-        return cls(agents, env.observation_spaces[agents[0]], env.action_spaces[agents[0]], state_size)
+        return cls(agents, tuple(env.observation_spaces[agent] for agent in agents), actions, state_size)
+
+
+def shares_reward(env: JointEnv, steps: int = 25) -> bool:
+    """Whether all agents got the same reward at every one of some random steps."""
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    spaces = [env.action_spaces[agent] for agent in env.agents]
+    size = max(flatdim(space) for space in spaces)
+    for _ in range(steps):
+        actions = np.zeros((env.num_envs, len(spaces), size), dtype=np.float32)
+        for agent, space in enumerate(spaces):
+            if isinstance(space, gym.spaces.Discrete):
+                actions[:, agent, 0] = rng.integers(space.n, size=env.num_envs)
+            else:
+                shape = (env.num_envs, *space.shape)
+                actions[:, agent, : space.shape[0]] = rng.uniform(space.low, space.high, shape)
+        discrete = isinstance(spaces[0], gym.spaces.Discrete)
+        _, rewards, terminated, truncated, _ = env.step(actions[..., 0].astype(np.int64) if discrete else actions)
+        if np.ptp(rewards, axis=1).max() > REWARD_TOLERANCE * max(1.0, float(np.abs(rewards).max())):
+            return False
+        if (terminated | truncated).any():
+            env.reset(mask=terminated | truncated)
+    return True
+
+
+class WithAgentIds:
+    """An environment whose observations begin with the agent's number as a one-hot vector.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: JointEnv) -> None:
+        self._env = env
+        self.num_envs, self.agents, self.action_spaces = env.num_envs, env.agents, env.action_spaces
+        zeros, ones = np.zeros(len(env.agents), np.float32), np.ones(len(env.agents), np.float32)
+        self.observation_spaces: dict[str, gym.Space[Any]] = {
+            agent: gym.spaces.Box(np.append(zeros, space.low), np.append(ones, space.high), dtype=np.float32)
+            for agent, space in env.observation_spaces.items()
+            if isinstance(space, gym.spaces.Box)
+        }
+        self._ids = np.broadcast_to(np.eye(len(env.agents), dtype=np.float32), (env.num_envs, *[len(env.agents)] * 2))
+
+    def _with_ids(self, obs: Float) -> Float:
+        return np.concatenate([self._ids, obs], axis=-1)
+
+    def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
+        """Resets all copies, or those of `mask`."""
+        obs, info = self._env.reset(seed=seed, mask=mask)
+        return self._with_ids(obs), info
+
+    def step(self, actions: Float) -> StepResult:
+        """Steps every copy."""
+        obs, *rest = self._env.step(actions)
+        return self._with_ids(obs), *rest  # type: ignore[return-value]
+
+    def state(self, kind: str | None = None) -> Float:
+        """The environment's own state `(E, S)`."""
+        return self._env.state(kind)
+
+    def close(self) -> None:
+        """Closes every copy."""
+        self._env.close()
 
 
 def register_envs() -> list[str]:
@@ -178,6 +282,7 @@ class StackedEnv:
         )
         self.observation_spaces = {a: space(a) for a, space in self.observation_spaces.items()}
         self.action_spaces = {a: space(a) for a, space in self.action_spaces.items()}
+        self._size = max(flatdim(space) for space in self.observation_spaces.values())
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`."""
@@ -196,14 +301,14 @@ class StackedEnv:
         return self._obs.copy(), {}
 
     def step(self, actions: Float) -> StepResult:
-        """Steps every copy by its agents' actions `(E, N, A)`."""
+        """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`."""
         assert self._obs is not None
         rewards = np.zeros(actions.shape[:2], dtype=np.float32)
         terminated, truncated = np.zeros((2, self.num_envs), dtype=np.bool_)
         metrics: dict[str, Float] = {}
         for copy, env in enumerate(self._envs):
             joint = {
-                agent: np.asarray(action, dtype=self.action_spaces[agent].dtype)
+                agent: self._action(self.action_spaces[agent], action)
                 for agent, action in zip(self.agents, actions[copy], strict=True)
             }
             obs, reward, terminations, truncations, infos = env.step(joint)
@@ -236,7 +341,18 @@ class StackedEnv:
                 f"{missing}, unexpected agents {extra}. Joint learning needs all of {self.agents} in every "
                 f"observation from reset to the end of the episode."
             )
-        return np.stack([np.asarray(obs[agent], dtype=np.float32).reshape(-1) for agent in self.agents])
+        rows = np.zeros((len(self.agents), self._size), dtype=np.float32)
+        for row, agent in zip(rows, self.agents, strict=True):
+            own = np.asarray(obs[agent], dtype=np.float32).reshape(-1)
+            row[: own.size] = own
+        return rows
+
+    @staticmethod
+    def _action(space: gym.Space[Any], action: Any) -> Any:
+        """One agent's action as its space has it: without padding, or with the number its numbers start from."""
+        if isinstance(space, gym.spaces.Discrete):
+            return int(action + space.start)
+        return np.asarray(action[: flatdim(space)], dtype=space.dtype)
 
     def state(self, kind: str | None = None) -> Float:
         """The environments' own `state()`, `(E, S)`.

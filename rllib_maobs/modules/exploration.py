@@ -7,6 +7,11 @@ import torch
 from torch import Tensor
 
 
+def gumbel(uniform: Tensor) -> Tensor:
+    """Standard Gumbel noise from uniform numbers in [0, 1)."""
+    return -torch.log(-torch.log(uniform.clamp(1e-20, 1.0 - 1e-7)))
+
+
 @dataclass(frozen=True)
 class Exploration:
     """Epsilon and Gaussian exploration with a linear decay (paper, table II; the decay is its code base's).
@@ -50,6 +55,28 @@ class Exploration:
         uniform = torch.rand(actions.shape, generator=generator) * 2.0 - 1.0
         greedy = torch.rand(actions.shape[:-1], generator=generator).unsqueeze(-1) >= epsilon
         return torch.where(greedy, (actions + noise).clamp(-1.0, 1.0), uniform)
+
+    def discrete(
+        self, values: Tensor, t: int, generator: torch.Generator | None = None, *, sample: bool = False
+    ) -> Tensor:
+        """Explores around the best of A discrete actions.
+
+        Args:
+            values: One value for each action `(..., A)`; -inf for what is not legal.
+            t: Env steps sampled so far, over all environment copies.
+            generator: Source of randomness; None takes torch's global one.
+            sample: Whether an action that is not uniform is drawn from the softmax of the values (by Gumbel's
+                trick) instead of being their maximum.
+
+        Returns:
+            The actions' numbers, `(...)`.
+        """
+        epsilon, _ = self.at(t)
+        uniform = torch.rand(values.shape, generator=generator).masked_fill(values.isneginf(), -1.0).argmax(-1)
+        if sample:
+            values = values + gumbel(torch.rand(values.shape, generator=generator))
+        greedy = torch.rand(values.shape[:-1], generator=generator) >= epsilon
+        return torch.where(greedy, values.argmax(-1), uniform)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Exploration":

@@ -32,13 +32,14 @@ def mlp(sizes: Sequence[int], activation: str = "relu") -> nn.Sequential:
 
 
 class MLPActor(nn.Module):
-    """Deterministic policy mu(o): observation in, action in [-1, 1] out.
+    """Deterministic policy mu(o), or one value for each of A discrete actions.
 
     Args:
         observation_size: O, length of the agent's observation.
-        action_size: A, length of its action.
+        action_size: A, length of its action, or the number of its discrete actions.
         hidden_sizes: Width of each hidden layer.
         activation: A key of `ACTIVATIONS`.
+        discrete: Whether the output is a value for each discrete action (logits, or Q) instead of an action.
     """
 
     def __init__(
@@ -47,17 +48,101 @@ class MLPActor(nn.Module):
         action_size: int,
         hidden_sizes: Sequence[int] = (64, 64, 64),
         activation: str = "relu",
+        discrete: bool = False,
     ) -> None:
         super().__init__()
+        self.discrete = discrete
         self.layers = mlp((observation_size, *hidden_sizes, action_size), activation)
 
+    def raw(self, observation: Tensor) -> Tensor:
+        """The last layer's output `(..., A)`, not squashed."""
+        return self.layers(observation)
+
     def forward(self, observation: Tensor) -> Tensor:
-        """Maps observations `(..., O)` to actions `(..., A)` in [-1, 1]."""
-        return torch.tanh(self.layers(observation))
+        """Maps observations `(..., O)` to actions `(..., A)` in [-1, 1], or to the values of discrete actions."""
+        output = self.raw(observation)
+        return output if self.discrete else torch.tanh(output)
+
+
+class LSTMActor(nn.Module):
+    """Deterministic policy over a window of the last T observations (eq. 10).
+
+    An LSTM cell takes the place of the first hidden layer and reads the window from its oldest observation to
+    its newest, from zero h and c; the other layers see its last h. Observations that the mask leaves out
+    (before the episode began) do not count: a masked window equals a shorter one. The cell is written
+    with linear layers, so it can be stacked; its numbers are those of `nn.LSTM` with one bias.
+
+    Args:
+        observation_size: O.
+        action_size: A, length of the action, or the number of discrete actions.
+        hidden_sizes: H, size of h and c, then the width of each further hidden layer.
+        activation: Of the further layers, a key of `ACTIVATIONS`.
+        discrete: Whether the output is a value for each discrete action instead of an action.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        hidden_sizes: Sequence[int] = (64, 64, 64),
+        activation: str = "relu",
+        discrete: bool = False,
+    ) -> None:
+        super().__init__()
+        self.discrete = discrete
+        size = hidden_sizes[0]
+        self.from_observation = nn.Linear(observation_size, 4 * size)
+        self.from_hidden = nn.Linear(size, 4 * size, bias=False)
+        for parameter in self.parameters():  # nn.LSTM's own way to start
+            nn.init.uniform_(parameter, -(size**-0.5), size**-0.5)
+        self.layers = mlp((*hidden_sizes, action_size), activation)
+
+    def unroll(
+        self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Runs the cell over a window.
+
+        Args:
+            window: Observations, oldest first, `(..., T, O)`.
+            mask: 1.0 where an observation counts, 0.0 where it lies before the episode's start, `(..., T)`.
+            hidden: h and c to start from, `(..., H)` each; None for zeros.
+
+        Returns:
+            The last h and c, `(..., H)` each.
+        """
+        gates = self.from_observation(window)  # all steps at once
+        for t in range(window.shape[-2]):
+            here = gates[..., t, :]
+            if hidden is not None:
+                here = here + self.from_hidden(hidden[0])
+            i, f, g, o = here.chunk(4, dim=-1)
+            c = torch.sigmoid(i) * torch.tanh(g)
+            if hidden is not None:
+                c = c + torch.sigmoid(f) * hidden[1]
+            h = torch.sigmoid(o) * torch.tanh(c)
+            valid = mask[..., t, None] > 0
+            if hidden is None:
+                hidden = torch.where(valid, h, 0.0), torch.where(valid, c, 0.0)
+            else:
+                hidden = torch.where(valid, h, hidden[0]), torch.where(valid, c, hidden[1])
+        assert hidden is not None
+        return hidden
+
+    def raw(self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """The last layer's output `(..., A)` for the window's last observation, not squashed."""
+        return self.layers(self.unroll(window, mask, hidden)[0])
+
+    def forward(self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Maps windows `(..., T, O)` and masks `(..., T)` to actions `(..., A)` in [-1, 1], or to discrete values."""
+        output = self.raw(window, mask, hidden)
+        return output if self.discrete else torch.tanh(output)
+
+
+ACTORS: dict[str, type[MLPActor] | type[LSTMActor]] = {"mlp": MLPActor, "lstm": LSTMActor}
 
 
 class Critic(nn.Module):
-    """Action value Q(s, u), an MLP on the concatenation of a state and an action.
+    """Action value Q(s, u), an MLP on the concatenation of a state and an action; or C of them side by side.
 
     What "state" and "action" are is the algorithm's choice: (o_i, u_i) in IDDPG, (s, u_1..u_N) in MADDPG,
     (s, u_i) in MADDPG-L. The first layer is kept in two parts, one for each of its inputs, because its product
@@ -69,6 +154,7 @@ class Critic(nn.Module):
         action_size: Length of the action part of the input.
         hidden_sizes: Width of each hidden layer.
         activation: A key of `ACTIVATIONS`.
+        num_critics: C, independent critics of the same inputs (two of them for TD3's minimum).
     """
 
     def __init__(
@@ -77,25 +163,29 @@ class Critic(nn.Module):
         action_size: int,
         hidden_sizes: Sequence[int] = (64, 64, 64),
         activation: str = "relu",
+        num_critics: int = 1,
     ) -> None:
         super().__init__()
-        first = nn.Linear(state_size + action_size, hidden_sizes[0])  # initialised as the one layer that it is
-        self.from_state = nn.Linear(state_size, hidden_sizes[0], bias=False)
-        self.from_action = nn.Linear(action_size, hidden_sizes[0])
+        width = num_critics * hidden_sizes[0]
+        first = nn.Linear(state_size + action_size, width)  # initialised as the one layer that it is
+        self.from_state = nn.Linear(state_size, width, bias=False)
+        self.from_action = nn.Linear(action_size, width)
         self.from_state.weight.data.copy_(first.weight[:, :state_size])
         self.from_action.weight.data.copy_(first.weight[:, state_size:])
         self.from_action.bias.data.copy_(first.bias)
         self.activation = ACTIVATIONS[activation]()
-        self.rest = mlp((*hidden_sizes, 1), activation)
+        self.rest = nn.ModuleList(mlp((*hidden_sizes, 1), activation) for _ in range(num_critics))
 
     def encode(self, state: Tensor) -> Tensor:
-        """The first layer's share of the state: `(..., S)` to `(..., H)`."""
+        """The first layers' share of the state: `(..., S)` to `(..., C * H)`."""
         return self.from_state(state)
 
     def value(self, encoded_state: Tensor, action: Tensor) -> Tensor:
-        """Q from an encoded state `(..., H)` and an action `(..., A)`: shape `(...)`."""
-        return self.rest(self.activation(encoded_state + self.from_action(action))).squeeze(-1)
+        """Q of every critic from an encoded state `(..., C * H)` and an action `(..., A)`: `(..., C)`."""
+        first = self.activation(encoded_state + self.from_action(action))
+        parts = first.chunk(len(self.rest), dim=-1)
+        return torch.cat([rest(part) for rest, part in zip(self.rest, parts, strict=True)], dim=-1)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Q(s, u) for states `(..., S)` and actions `(..., A)`: shape `(...)`."""
+        """Q(s, u) of every critic for states `(..., S)` and actions `(..., A)`: `(..., C)`."""
         return self.value(self.encode(state), action)

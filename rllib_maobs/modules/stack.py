@@ -1,4 +1,4 @@
-"""Alike networks of several agents as one: their parameters in one flat tensor, one call for all of them."""
+"""Networks of several agents as one: their parameters in one flat tensor, one call for all of them."""
 
 from __future__ import annotations
 
@@ -9,46 +9,65 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
 Params = dict[str, Tensor]
-"""Parameters of M alike networks by name, each `(M, *shape)`."""
+"""Parameters of M networks by name, each `(M, *shape)`."""
 
 
 class Stack:
-    """M networks of one architecture whose parameters live in one flat tensor.
+    """The networks of N agents, whose parameters live in one flat tensor.
 
     The networks stay ordinary modules: each of their parameters becomes a view of `flat`, so a checkpoint
     of one of them, `load_state_dict` into one of them, and an optimiser step on `flat` all see the same
     numbers. One flat vector per role also makes Adam and Polyak averaging a single pass each.
 
+    Agents may share a network (parameter sharing): it then has one row, however many agents use it. Networks of
+    agents whose observations or actions differ in length are padded with zeros to the largest: inputs padded
+    with zeros leave the padding's gradients at zero, so it stays zero, and one batched product serves all.
+
     Args:
-        networks: The networks; equal architectures, separate parameters.
+        networks: Every agent's network, of one kind and depth. One that is listed several times is shared.
         methods: The methods of them that the stack can call.
+        tie: Whether all agents are to share one row, that of the first network.
 
     Raises:
-        ValueError: If the networks' parameters differ in name or shape, or are shared between networks.
+        ValueError: If the networks differ in more than the sizes of their parameters.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], methods: Sequence[str] = ("forward",)) -> None:
-        shapes = [{name: tuple(p.shape) for name, p in net.named_parameters()} for net in networks]
-        for index, shape in enumerate(shapes):
-            if shape != shapes[0]:
-                raise ValueError(f"Networks 0 and {index} differ, so they cannot be stacked: {shapes[0]} and {shape}.")
-        if any(any(True for _ in net.buffers()) for net in networks):
+    def __init__(self, networks: Sequence[nn.Module], methods: Sequence[str] = ("forward",), tie: bool = False) -> None:
+        distinct = list({id(net): net for net in networks}.values())
+        names = [{name: p.dim() for name, p in net.named_parameters()} for net in distinct]
+        for index, own in enumerate(names):
+            if own != names[0]:
+                raise ValueError(f"Networks 0 and {index} differ, so they cannot be stacked: {names[0]} and {own}.")
+        if any(any(True for _ in net.buffers()) for net in distinct):
             raise ValueError("Networks with buffers (e.g. BatchNorm) cannot be stacked; use LayerNorm instead.")
         self.networks = list(networks)
+        self.rows = [0 if tie else next(i for i, d in enumerate(distinct) if d is net) for net in networks]
+        owners = distinct[: 1 if tie else None]
         # The first network only lends its code; functional_call puts the stacked parameters in its own's place.
         self._methods = {name: _Method(networks[0], name) for name in methods}
-        stacked = {name: torch.stack([net.get_parameter(name).detach() for net in networks]) for name in shapes[0]}
-        self._shapes = {name: value.shape for name, value in stacked.items()}
-        self.flat = nn.Parameter(torch.cat([value.reshape(-1) for value in stacked.values()]))
-        self.params: Params = {}
+        self._shapes = {
+            name: (
+                len(owners),
+                *(max(sizes) for sizes in zip(*(n.get_parameter(name).shape for n in distinct), strict=True)),
+            )
+            for name in names[0]
+        }
+        total = sum(torch.Size(shape).numel() for shape in self._shapes.values())
+        like = next(networks[0].parameters())
+        self.flat = nn.Parameter(torch.zeros(total, dtype=like.dtype, device=like.device))
+        self.params: Params = self.unflatten(self.flat.detach())
+        for row, net in enumerate(owners):
+            for name, parameter in net.named_parameters():
+                _corner(self.params[name][row], parameter).copy_(parameter.detach())
         self._bind()
 
     def _bind(self) -> None:
         """Makes `params` and every network's own parameters views of `flat`."""
         self.params = self.unflatten(self.flat.detach())
-        for index, net in enumerate(self.networks):
+        self._index = torch.tensor(self.rows, device=self.flat.device)
+        for row, net in zip(self.rows, self.networks, strict=True):
             for name, parameter in net.named_parameters():
-                parameter.data = self.params[name][index]
+                parameter.data = _corner(self.params[name][row], parameter)
 
     def share(self, other: Stack) -> None:
         """Uses the tensors of another stack of the same shape from now on, instead of copies of them.
@@ -56,14 +75,14 @@ class Stack:
         Raises:
             ValueError: If the other stack's networks have a different architecture or number.
         """
-        if self._shapes != other._shapes:
+        if self._shapes != other._shapes or self.rows != other.rows:
             raise ValueError(f"Stacks differ: {self._shapes} and {other._shapes}.")
         self.flat = other.flat
         self._bind()
 
     def unflatten(self, flat: Tensor) -> Params:
         """Views of a flat vector `(P,)` as stacked parameters by name."""
-        sizes = [shape.numel() for shape in self._shapes.values()]
+        sizes = [torch.Size(shape).numel() for shape in self._shapes.values()]
         parts = flat.split(sizes)
         return {name: part.view(shape) for (name, shape), part in zip(self._shapes.items(), parts, strict=True)}
 
@@ -71,24 +90,42 @@ class Stack:
         """One flat vector `(P,)` from stacked parameters (or gradients) by name; a copy."""
         return torch.cat([params[name].reshape(-1) for name in self._shapes])
 
+    def spread(self, rows: Tensor, dim: int = 0) -> Tensor:
+        """What is there for each row, along a dimension, for each agent instead: the same if nothing is shared."""
+        return rows if self.rows == list(range(len(self.rows))) else rows.index_select(dim, self._index)
+
     def __call__(self, params: Params, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
-        """Applies all M networks at once.
+        """Applies all agents' networks at once.
 
         Args:
             params: Stacked parameters to use, e.g. `self.params` or the tracked ones inside `torch.func.grad`.
-            *inputs: Pairs of a tensor and the dimension of it that runs over the M networks; None for a
+            *inputs: Pairs of a tensor and the dimension of it that runs over the N agents; None for a
                 tensor that all networks see.
             method: The network's method to call.
 
         Returns:
-            The output, with the M networks at dimension 1: `(B, M, ...)`.
+            The output, with the N agents at dimension 1: `(B, N, ...)`.
         """
         tensors, dims = zip(*inputs, strict=True)
 
         def one(p: Params, *args: Tensor) -> Tensor:
             return functional_call(self._methods[method], {f"net.{k}": v for k, v in p.items()}, args)
 
-        return vmap(one, in_dims=(0, *dims), out_dims=1)(params, *tensors)
+        alone = len(self.rows) > 1 and set(self.rows) == {0}
+        if not alone:
+            each = {name: self.spread(value) for name, value in params.items()}
+            return vmap(one, in_dims=(0, *dims), out_dims=1)(each, *tensors)
+        # One network for all: its weights meet all agents' inputs in one product.
+        single = {name: value[0] for name, value in params.items()}
+        if all(dim is None for dim in dims):
+            same = one(single, *tensors).unsqueeze(1)
+            return same.expand(-1, len(self.rows), *same.shape[2:])
+        return vmap(one, in_dims=(None, *dims), out_dims=1)(single, *tensors)
+
+
+def _corner(padded: Tensor, like: Tensor) -> Tensor:
+    """The part of a padded tensor that has another's shape."""
+    return padded[tuple(slice(size) for size in like.shape)]
 
 
 class _Method(nn.Module):

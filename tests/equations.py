@@ -1,0 +1,269 @@
+"""Every algorithm's losses, written from the equations as loops over agents in plain PyTorch.
+
+It shares no code with the package: networks are lists of weight matrices taken from its modules, nothing is stacked,
+padded or masked: windows are unrolled by `torch.nn.LSTMCell` over the observations that count and no others, agents
+with shorter observations get theirs without the padding, and agents that share a policy use the very same tensors, so
+that autograd adds their gradients up.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+Layers = list[Tensor]  # weight, bias, weight, bias, ...
+
+
+def leaves(network: nn.Module) -> Layers:
+    """A network's parameters as tensors of our own; a critic's first weight, kept in two parts, is put together."""
+    tensors = [p.detach().clone() for p in network.parameters()]
+    if hasattr(network, "from_state"):
+        tensors = [torch.cat(tensors[:2], dim=1), *tensors[2:]]
+    return [t.requires_grad_() for t in tensors]
+
+
+def mlp(layers: Layers, x: Tensor) -> Tensor:
+    for i in range(0, len(layers), 2):
+        x = layers[i] @ x + layers[i + 1]
+        if i < len(layers) - 2:
+            x = x.clamp(min=0.0)
+    return x
+
+
+def lstm(layers: Layers, observations: Tensor) -> Tensor:
+    """An LSTM cell from zero over observations `(t, O)`, then the other layers."""
+    weight, bias, recurrent, *rest = layers
+    size = recurrent.shape[1]
+    cell = nn.LSTMCell(observations.shape[1], size)
+    own = {"weight_ih": weight, "bias_ih": bias, "weight_hh": recurrent, "bias_hh": torch.zeros(4 * size)}
+    h = c = torch.zeros(size)
+    for x in observations:
+        h, c = functional_call(cell, own, (x, (h, c)))
+    return mlp(rest, h)
+
+
+class Equations:
+    """Losses and gradients of a learner's algorithm, for its present parameters."""
+
+    def __init__(self, learner: Any) -> None:
+        self.config = learner.config
+        team = self.config.team
+        self.agents = range(len(team.agents))
+        self.sizes, self.actions = team.observation_sizes, team.action_sizes
+        self.discrete, self.name = team.discrete, self.config.name
+        modules = {mid: learner.module[mid] for mid in self.config.module_ids}
+        kinds = ["utility"] if hasattr(next(iter(modules.values())), "utility") else ["actor", "critic"]
+        self.nets: dict[str, list[Layers]] = {}
+        for kind in (*kinds, *(f"target_{kind}" for kind in kinds)):
+            own = {mid: leaves(getattr(module, kind)) for mid, module in modules.items()}
+            first = own[self.config.module_ids[0]]
+            tied = kind.endswith("critic") and getattr(self.config, "critic_source", "") == "shared"
+            self.nets[kind] = [first if tied else own[mid] for mid in self.config.module_ids]
+        self.mixers: list[dict[str, Tensor]] = []
+        self.target_mixers: list[dict[str, Tensor]] = []
+        if "mixer" in learner.module:
+            for kind, mixers in (("mixers", self.mixers), ("target_mixers", self.target_mixers)):
+                for network in getattr(learner.module["mixer"], kind):
+                    mixers.append({n: p.detach().clone().requires_grad_() for n, p in network.named_parameters()})
+
+    # What the networks see.
+
+    def seen(self, sample: dict[str, Tensor], row: int, agent: int, prefix: str) -> Tensor:
+        """What an agent sees: its observations `(t, O)`, the last one being the present one."""
+        size = self.sizes[agent]
+        if f"{prefix}window" in sample:
+            counts = int(sample[f"{prefix}mask"][row].sum())
+            return sample[f"{prefix}window"][row, -counts:, agent, :size]
+        return sample[f"{prefix}obs"][row, None, agent, :size]
+
+    def output(self, kind: str, sample: dict[str, Tensor], row: int, agent: int, prefix: str = "") -> Tensor:
+        observations, layers = self.seen(sample, row, agent, prefix), self.nets[kind][agent]
+        return lstm(layers, observations) if self.config.actor == "lstm" else mlp(layers, observations[-1])
+
+    def state(self, sample: dict[str, Tensor], row: int, prefix: str) -> Tensor:
+        if self.config.critic_state == "world":
+            return sample[f"{prefix}state"][row]
+        ids = len(self.agents) if self.config.agent_id_input else 0
+        return torch.cat([self.seen(sample, row, a, prefix)[-1][ids:] for a in self.agents])
+
+    def next_action(self, sample: dict[str, Tensor], row: int, agent: int) -> Tensor:
+        output = self.output("target_actor", sample, row, agent, "next_")
+        if self.discrete:
+            return torch.eye(len(output))[output.argmax()]
+        action = torch.tanh(output)
+        if self.config.target_noise:
+            limit = self.config.target_noise_clip
+            noise = sample["noise"][row, agent, : len(action)] * self.config.target_noise
+            action = (action + noise.clamp(-limit, limit)).clamp(-1, 1)
+        return action
+
+    def action(self, sample: dict[str, Tensor], row: int, agent: int) -> tuple[Tensor, Tensor]:
+        """The current action of an agent, through which its actor learns, and the output before tanh."""
+        output = self.output("actor", sample, row, agent)
+        if not self.discrete:
+            return torch.tanh(output), output
+        uniform = sample["noise"][row, agent, : len(output)]
+        soft = torch.softmax((output - torch.log(-torch.log(uniform))) / self.config.gumbel_temperature, 0)
+        return torch.eye(len(output))[soft.argmax()] - soft.detach() + soft, output
+
+    def q(self, kind: str, sample: dict[str, Tensor], row: int, agent: int, joint: list[Tensor], prefix: str) -> Tensor:
+        """Q of one agent's critics in the joint action, one for each of its twins."""
+        ids = self.config.agent_id_input and self.config.uses_state
+        own = [torch.eye(len(self.agents))[agent]] if ids else []
+        if self.name == "iddpg":
+            x = torch.cat([self.seen(sample, row, agent, prefix)[-1], joint[agent]])
+        elif self.name == "maddpg-l":
+            padding = [torch.zeros(max(self.actions) - len(joint[agent]))]
+            x = torch.cat([self.state(sample, row, prefix), joint[agent], *padding, *own])
+        else:
+            padded = [torch.cat([u, torch.zeros(max(self.actions) - len(u))]) for u in joint]
+            x = torch.cat([self.state(sample, row, prefix), *padded, *own])
+        return self.critic(self.nets[kind][agent], x)
+
+    def critic(self, layers: Layers, x: Tensor) -> Tensor:
+        first, bias, *rest = layers
+        heads = 2 if self.config.twin_critics else 1
+        width, depth = len(bias) // heads, len(rest) // heads
+        return torch.cat(
+            [
+                mlp(
+                    [
+                        first[h * width : (h + 1) * width],
+                        bias[h * width : (h + 1) * width],
+                        *rest[h * depth : (h + 1) * depth],
+                    ],
+                    x,
+                )
+                for h in range(heads)
+            ]
+        )
+
+    def mixed(self, mixer: dict[str, Tensor], values: list[Tensor], state: Tensor) -> Tensor:
+        """ELU(q W_1(s) + b_1(s)) w_2(s) + b_2(s), in sums over agents and mixing units."""
+        generated = {n: mixer[f"{n}.weight"] @ state + mixer[f"{n}.bias"] for n in ("weight_1", "bias_1", "weight_2")}
+        if self.name == "qmix":
+            generated["weight_1"], generated["weight_2"] = generated["weight_1"].abs(), generated["weight_2"].abs()
+        units = len(generated["bias_1"])
+        total = mlp([mixer[f"bias_2.{n}"] for n in ("0.weight", "0.bias", "2.weight", "2.bias")], state)[0]
+        for unit in range(units):
+            x = generated["bias_1"][unit]
+            for agent, value in enumerate(values):
+                x = x + value * generated["weight_1"][agent * units + unit]
+            total = total + torch.where(x > 0, x, torch.exp(x) - 1) * generated["weight_2"][unit]
+        return total
+
+    # The losses.
+
+    def losses(self, sample: dict[str, Tensor], stage: str = "") -> tuple[list[Tensor], list[Tensor]]:
+        """The critics' and the actors' losses, one for each agent or one for the team."""
+        rewards = sample["rewards"] * self.config.reward_scale
+        rows = range(len(rewards))
+        critic: dict[int, list[Tensor]] = {}
+        actor: dict[int, list[Tensor]] = {}
+        for row in rows:
+            r, discount = rewards[row], sample["discount"][row, 0]
+            if self.name in ("iql", "vdn", "qmix"):
+                self.q_learning(sample, row, r, discount, critic)
+                continue
+            taken = [sample["actions"][row, a, : self.actions[a]] for a in self.agents]
+            nexts = [self.next_action(sample, row, a).detach() for a in self.agents]
+            now, outputs = zip(*(self.action(sample, row, a) for a in self.agents), strict=True)
+            for a in self.agents:
+                regular = self.config.action_regularization * outputs[a].square().sum() / max(self.actions)
+                actor.setdefault(-1, []).append(regular)
+            if self.name == "facmac":
+                self.facmac(sample, row, r, discount, taken, nexts, now, stage, critic, actor)
+                continue
+            for a in self.agents:
+                y = r[a] + discount * self.q("target_critic", sample, row, a, nexts, "next_").min().detach()
+                q = self.q("critic", sample, row, a, taken, "")
+                critic.setdefault(a, []).append((y - q).square().sum())
+                others = getattr(self.config, "other_agents_actions", "replay")
+                fixed = taken if others == "replay" else [u.detach() for u in now] if others == "current" else now
+                joint = [now[b] if a == b else fixed[b] for b in self.agents]
+                actor.setdefault(a, []).append(-self.q("critic", sample, row, a, joint, "")[0])
+        self.regular = torch.stack(actor.pop(-1)).sum() / len(rows) if actor else torch.zeros(())
+
+        def mean(parts: dict[int, list[Tensor]]) -> list[Tensor]:
+            return [torch.stack(terms).mean() for _, terms in sorted(parts.items())]
+
+        return mean(critic), mean(actor)
+
+    def facmac(
+        self,
+        sample: dict[str, Tensor],
+        row: int,
+        r: Tensor,
+        discount: Tensor,
+        taken: list[Tensor],
+        nexts: list[Tensor],
+        now: tuple[Tensor, ...],
+        stage: str,
+        critic: dict[int, list[Tensor]],
+        actor: dict[int, list[Tensor]],
+    ) -> None:
+        own = self.config.critic_source == "own"
+
+        def local(kind: str, judge: int, judged: int, u: Tensor, prefix: str) -> Tensor:
+            x = torch.cat([self.seen(sample, row, judged, prefix)[-1], u])
+            return self.critic(self.nets[kind][judge], x)[0]
+
+        if stage == "local":
+            for a in self.agents:
+                y = r[a] + discount * local("target_critic", a, a, nexts[a], "next_").detach()
+                critic.setdefault(a, []).append((y - local("critic", a, a, taken[a], "")).square())
+                actor.setdefault(a, []).append(-local("critic", a, a, now[a], ""))
+            return
+        for m, (mixer, target_mixer) in enumerate(zip(self.mixers, self.target_mixers, strict=True)):
+            values = [local("target_critic", m if own else j, j, nexts[j], "next_") for j in self.agents]
+            y = r[0] + discount * self.mixed(target_mixer, values, self.state(sample, row, "next_")).detach()
+            values = [local("critic", m if own else j, j, taken[j], "") for j in self.agents]
+            critic.setdefault(m, []).append((y - self.mixed(mixer, values, self.state(sample, row, ""))).square())
+            current = [now[j].detach() if own and j != m else now[j] for j in self.agents]
+            values = [local("critic", m if own else j, j, current[j], "") for j in self.agents]
+            actor.setdefault(m, []).append(-self.mixed(mixer, values, self.state(sample, row, "")))
+
+    def q_learning(
+        self, sample: dict[str, Tensor], row: int, r: Tensor, discount: Tensor, critic: dict[int, list[Tensor]]
+    ) -> None:
+        values, nexts = [], []
+        for a in self.agents:
+            values.append(self.output("utility", sample, row, a)[sample["actions"][row, a].argmax()])
+            after = self.output("target_utility", sample, row, a, "next_").detach()
+            judge = self.output("utility", sample, row, a, "next_") if self.config.double_q else after
+            nexts.append(after[judge.argmax()])
+        if self.name == "iql":
+            for a in self.agents:
+                critic.setdefault(a, []).append((r[a] + discount * nexts[a] - values[a]).square())
+            return
+        if self.name == "vdn":
+            q, next_q = sum(values), sum(nexts)
+        else:
+            q = self.mixed(self.mixers[0], values, self.state(sample, row, ""))
+            next_q = self.mixed(self.target_mixers[0], nexts, self.state(sample, row, "next_")).detach()
+        critic.setdefault(0, []).append((r[0] + discount * next_q - q).square())
+
+    def gradients(self, sample: dict[str, Tensor], stage: str = "") -> dict[str, Any]:
+        """Losses by role, and gradients: of every distinct network a list, in the order of its parameters."""
+        critic, actor = self.losses(sample, stage)
+        kind = "utility" if "utility" in self.nets else "critic"
+        result: dict[str, Any] = {"critic_loss": [x.item() for x in critic], "actor_loss": [x.item() for x in actor]}
+
+        def distinct(nets: list[Layers]) -> list[Layers]:
+            return list({id(net): net for net in nets}.values())
+
+        def gradient(total: Tensor, nets: list[Layers]) -> list[Layers]:
+            flat = [tensor for net in nets for tensor in net]
+            found = iter(torch.autograd.grad(total, flat, retain_graph=True, allow_unused=True))
+            return [[torch.zeros_like(t) if (g := next(found)) is None else g for t in net] for net in nets]
+
+        total = torch.stack(critic).sum()
+        result["critic"] = gradient(total, distinct(self.nets[kind]))
+        if self.mixers and stage != "local":
+            result["mixer"] = gradient(total, [list(mixer.values()) for mixer in self.mixers])
+        if not actor:
+            return result
+        # Where a loss is one agent's alone, the others' actions in it are constants: the sum keeps the gradients apart.
+        result["actor"] = gradient(torch.stack(actor).sum() + self.regular, distinct(self.nets["actor"]))
+        return result
