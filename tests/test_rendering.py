@@ -3,12 +3,14 @@
 import copy
 import pickle
 import sys
+import time
 import warnings
 from functools import partial
 from types import SimpleNamespace
 
 import imageio.v2 as imageio
 import numpy as np
+import pygame
 import pytest
 from pettingzoo.test import max_cycles_test, parallel_seed_test, render_test
 from pettingzoo.test.state_test import test_parallel_env as check_state
@@ -174,6 +176,72 @@ def test_trails_and_velocity_marks():
     assert mark.any(axis=0).all()
 
 
+def test_walls_flash_those_who_touch_them():
+    env = parallel_env("simple-tunnel", render_mode="rgb_array")
+    env.reset(seed=0)
+    env._copy.env.world.position[0, 0] = [-1.34, 0.3]
+    assert flashes(env) == 0
+    env.step(dict.fromkeys(env.agents, np.array([0, 0, 1, 0, 0], np.float32)))
+    assert flashes(env) > 50
+
+
+def test_trails_end_with_the_episode():
+    env = parallel_env("tunnel", render_mode="rgb_array")  # always starts alike
+    env.reset(seed=0)
+    start = env.render()
+    for _ in range(10):
+        env.step(env.heuristic())
+    env.reset()
+    np.testing.assert_array_equal(env.render(), start)
+
+
+def around(frame, env, body, radius):
+    """The part of a picture within a radius (along x and y) of a body, its middle pixel, and pixels per unit."""
+    renderer = env._copy._renderer
+    x, y = env._copy.env.world.position[0, body]
+    scale = renderer.width / (2 * renderer.half_width)
+    row, column, size = (
+        int((renderer.half_height - y) * scale),
+        int((x + renderer.half_width) * scale),
+        int(radius * scale),
+    )
+    part = frame[row - size : row + size + 1, column - size : column + size + 1]
+    return part, part[size : size + 1, size : size + 1], scale
+
+
+@pytest.mark.parametrize("goal_radius", [0.08, 0.12])
+@pytest.mark.parametrize(
+    ("scenario_id", "colors"),
+    [("simple-tunnel", [(66, 114, 196), (222, 135, 46)]), ("tunnel", [(150, 156, 166), (150, 156, 166)])],
+)
+def test_targets_are_rings_to_scale_in_the_colour_of_their_owner(scenario_id, colors, goal_radius):
+    env = parallel_env(scenario_id, render_mode="rgb_array", goal_radius=goal_radius)
+    env.reset(seed=0)
+    frame = env.render()
+    for body, color in zip((5, 6), colors, strict=True):
+        part, middle, scale = around(frame, env, body, 0.145)
+        assert colored(middle, color).all()
+        columns = np.nonzero(colored(part, color, 40).any(axis=0))[0]
+        assert columns.max() - columns.min() == pytest.approx(2 * goal_radius * scale, abs=3)
+
+
+def test_targets_are_seen_above_the_agents_that_cover_them():
+    env = parallel_env("tunnel", render_mode="rgb_array")
+    env.reset(seed=0)
+    env._copy.env.world.position[0, 0] = env._copy.env.world.position[0, 5] + [0.03, 0.0]
+    part, middle, _ = around(env.render(), env, 5, 0.035)
+    assert colored(middle, (150, 156, 166)).all() and colored(part, BACKGROUND).sum() > 20
+
+
+def test_the_prey_is_green_and_predators_differ():
+    env = parallel_env("obstacle-predator-prey", render_mode="rgb_array")
+    env.reset(seed=0)
+    env._copy.env.world.position[0] = [[-1, 0], [0, 0], [1, 0], [0, 1], [1, 1], [-1, -1]]
+    frame = env.render()
+    for body, color in enumerate([(66, 114, 196), (222, 135, 46), (139, 95, 184), (56, 160, 74)]):
+        assert colored(around(frame, env, body, 0.03)[0], color).sum() > 20
+
+
 def test_agents_outside_are_seen_at_the_border():
     env = parallel_env("spread-3a", render_mode="rgb_array", num_agents=1, num_obstacles=0)
     env.reset(seed=0)
@@ -212,8 +280,6 @@ def test_human_mode_shows_every_step(monkeypatch):
 
 
 def test_human_mode_runs_in_real_time_and_closes():
-    import time
-
     env = parallel_env("tunnel", render_mode="human")
     env.reset(seed=0)
     start = time.perf_counter()
@@ -223,6 +289,10 @@ def test_human_mode_runs_in_real_time_and_closes():
     again = pickle.loads(pickle.dumps(env))
     env.close()
     env.close()
+    env.reset()  # the window opens again
+    assert pygame.display.get_surface() is not None
+    env.close()
+    assert pygame.display.get_surface() is None
     again.step(again.heuristic())
     again.close()
 

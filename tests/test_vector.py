@@ -52,6 +52,15 @@ def test_masked_seeds():
     obs, _ = env.reset(seed=[4, 5, 6], mask=np.array([False, True, False]))
     np.testing.assert_array_equal(obs[1], whole[1])
     assert env.seeds.tolist() == [100, 5, 102]
+    # The streams of the others go on.
+    twin = make_vec("spread-3a", num_envs=3)
+    twin.reset(seed=100)
+    np.testing.assert_array_equal(env.reset()[0][[0, 2]], twin.reset()[0][[0, 2]])
+
+
+def test_without_a_seed_every_environment_is_another():
+    first, second = (make_vec("spread-3a", num_envs=2).reset()[0] for _ in range(2))
+    assert not np.array_equal(first, second) and not np.array_equal(first[0], first[1])
 
 
 def test_terminates_on_success_if_asked():
@@ -62,6 +71,7 @@ def test_terminates_on_success_if_asked():
     assert terminated.tolist() == [False, True] and truncated.tolist() == [False, False]
     metrics = {name: value[1] for name, value in info["episode_metrics"].items()}
     assert metrics["success"] == metrics["time_to_goal"] == metrics["episode_length"] == 1.0
+    assert metrics["coverage_mean"] == 1.0  # the mean over the steps that were played
     assert np.isnan(info["episode_metrics"]["success"][0])
 
 
