@@ -117,6 +117,7 @@ def test_same_seed_same_episode_on_all_faces(scenario_id, mode):
         np.testing.assert_array_equal([obs[a] for a in vec.agents], observations[100, 0])
         for agent in vec.agents:
             assert infos[agent]["episode_metrics"] == {name: v[0] for name, v in metrics.items()}
+            infos[agent]["episode_metrics"].clear()  # nobody else's
         np.testing.assert_array_equal(face.state(), vec.state()[0])
         np.testing.assert_array_equal(face.state("world"), vec.state("world")[0])
     assert "__all__" in truncated and zoo.agents == [] and rllib.agents == vec.agents

@@ -40,6 +40,22 @@ def test_metrics_are_those_of_the_episodes(capsys):
         assert float(printed[name]) == pytest.approx(value, abs=6e-4)
 
 
+def test_mean_return_is_that_of_all_agents():
+    env = parallel_env("simple-tunnel-6a", horizon=10)
+    vec, total = make_vec("simple-tunnel-6a", horizon=10), 0.0
+    vec.reset(seed=0)
+    for _ in range(10):
+        total += vec.step(vec.heuristic())[1].mean()
+    metrics = play(env, make_policy(env, "heuristic"))
+    assert metrics["return_mean"] == pytest.approx(total) != pytest.approx(metrics["return_agent_0"])
+
+
+def test_random_policy_moves_every_agent_by_itself():
+    env = parallel_env("simple-tunnel")
+    actions = make_policy(env, "random")(env.reset(seed=0)[0])
+    assert len({tuple(action) for action in actions.values()}) == 3
+
+
 def test_random_policy_follows_the_seed():
     results = []
     for seed in (0, 0, 1):
@@ -52,8 +68,10 @@ def test_window_opens_without_record(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     shown = []
     monkeypatch.setattr("rllib_maobs.envs.rendering.Renderer.show", lambda self, fps: shown.append(fps))
+    closed = []
+    monkeypatch.setattr("rllib_maobs.envs.rendering.Renderer.close", lambda self: closed.append(len(shown)))
     main(["tunnel", "horizon=4"])
-    assert len(shown) == 5
+    assert len(shown) == 5 and closed == [5]
 
 
 def test_options_are_literals_or_words():

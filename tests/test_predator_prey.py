@@ -60,6 +60,9 @@ def test_predators_share_what_they_catch_and_touch():
     outcome = env.scenario.outcome(env.world)
     assert outcome.metrics["captures"][0] == 2 and outcome.success[0]
     np.testing.assert_allclose(outcome.rewards[0], 3 * [2 * 5.0 - 2 * 0.5 - 2.0])
+    env.world.position[0, 0:6] = [[-0.1, 0.0], [0.5, 0.5], [-0.5, 0.5], [0.0, 0.0], [0.2, 0.0], [9.0, 9.0]]
+    env.world.refresh()  # the prey is on the obstacle: no business of the predators
+    np.testing.assert_allclose(env.scenario.outcome(env.world).rewards[0], 3 * [5.0])
     shaped = chase(shaping=0.1)
     place(shaped, [[0.3, 0.4], [0.0, 1.0], [-2.0, 0.0], [0.0, 0.0], *FAR])
     shaped.world.refresh()

@@ -340,9 +340,12 @@ def test_films_show_every_picture(tmp_path, name):
         film.seek(5)
         assert film.info["duration"] == 100
         film.seek(12)
+        assert film.info["duration"] == 1000  # the end stays for a second
         end = np.asarray(film.convert("RGB"))
     else:
-        frames = [frame for frame in imageio.get_reader(path)]
+        reader = imageio.get_reader(path)
+        assert reader.get_meta_data()["fps"] == 10
+        frames = [frame for frame in reader]
         assert len(frames) == 13
         end = frames[-1]
     assert end.shape == last.shape

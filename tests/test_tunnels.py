@@ -77,6 +77,19 @@ def test_simple_tunnel_walls_hold():
     assert (metrics["collisions_walls"] > 100).all()
 
 
+def test_walls_are_collisions():
+    """Agent 1 pushes into a corner, at both walls, in two steps of three; nobody touches anything else."""
+    env = make_vec("simple-tunnel", horizon=3)
+    env.reset(seed=0)
+    start = env.world.position[0, 1].copy()
+    for x, y in ([-1.36, 0.96], [-1.36, 0.96], start):
+        env.world.position[0, 1], env.world.velocity[0] = [x, y], 0.0
+        *_, info = env.step(np.array([[[0, 0, 0, 0, 0], [0, 0, 1, 1, 0], [0, 0, 0, 0, 0]]]))
+    metrics = episode_metrics(info)
+    assert metrics["collisions_walls"] == 4.0 and metrics["collision_free"] == 0.0
+    assert metrics["collisions_agents"] == metrics["collisions_obstacles"] == 0.0
+
+
 def test_start_noise_moves_agents_alone_and_differs_between_copies():
     env = make_vec("tunnel", num_envs=128, start_noise=0.05)
     still = make_vec("tunnel")
