@@ -1,7 +1,7 @@
 """Spread with nine agents: cover nine targets among six obstacles without collisions (figure 9 of the paper).
 
-    python tuned_examples/spread9a.py                # the paper's size: IDDPG, MADDPG and MADDPG-L, three seeds each
-    python tuned_examples/spread9a.py --quick        # the same job in a few minutes
+    python tuned_examples/spread9a.py                 # the paper's size: all five algorithms, three seeds each
+    python tuned_examples/spread9a.py --quick         # the same job in a few minutes
     python tuned_examples/spread9a.py --help
 
 Before it starts, the script measures how fast it runs on this machine, and says how long it will take.
@@ -12,13 +12,14 @@ from rllib_maobs.experiment import Experiment
 experiment = Experiment(
     name="spread-9a",
     env="maobs/spread-9a",
-    algorithms=("iddpg", "maddpg", "maddpg-l"),
+    algorithms=("iddpg", "maddpg", "maddpg-lstm", "maddpg-l", "facmac"),
     stop_timesteps=2_000_000,  # table II
     training={
-        # Table V; its sequence length, 3, is for LSTM actors only.
+        # Table V.
         "actor_lr": 0.001,
         "critic_lr": 0.01,
         "train_batch_size_per_learner": 32,
+        "seq_length": 3,  # of LSTM actors
         # Table II.
         "gamma": 0.95,
         "exploration": {"epsilon": 0.1, "noise": 0.1},

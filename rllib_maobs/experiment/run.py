@@ -48,7 +48,9 @@ class Experiment:
     Attributes:
         name: Names the default results folder.
         env: Registered name of the environment.
-        algorithms: Names of the algorithms.
+        algorithms: Names of the algorithms, or of variants.
+        variants: Algorithms with settings of their own, by the name they shall have in tables: `"algorithm"`, one of
+            `maobs.ALGORITHMS`, and arguments of its `training()`. A function there is called with a trial's env steps.
         training: Arguments of the configs' `training()`, the same for all algorithms.
         env_config: Options of the environment.
         stop_timesteps: Env steps of a trial.
@@ -58,12 +60,14 @@ class Experiment:
     env: str
     algorithms: Sequence[str]
     training: Mapping[str, Any]
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     env_config: Mapping[str, Any] = field(default_factory=dict)
     stop_timesteps: int = 2_000_000
 
     def __post_init__(self) -> None:
-        if unknown := set(self.algorithms) - set(maobs.ALGORITHMS):
-            raise ValueError(f"Unknown algorithms {sorted(unknown)}; legal are {', '.join(maobs.ALGORITHMS)}.")
+        named = [self.variants.get(name, {"algorithm": name}).get("algorithm") for name in self.algorithms]
+        if unknown := [repr(name) for name in named if name not in maobs.ALGORITHMS]:
+            raise ValueError(f"Unknown algorithms {', '.join(unknown)}; legal are {', '.join(maobs.ALGORITHMS)}.")
 
     def main(self, argv: Sequence[str] | None = None) -> None:
         """Run the command line.
@@ -93,12 +97,19 @@ class Experiment:
 
     def specs(self, args: Namespace) -> list[TrialSpec]:
         """Return the trials, seed by seed, so that the first results compare all algorithms."""
+
+        def training(algorithm: str) -> dict[str, Any]:
+            own = {name: value for name, value in self.variants.get(algorithm, {}).items() if name != "algorithm"}
+            own = {name: value(args.stop_timesteps) if callable(value) else value for name, value in own.items()}
+            return {**self.training, "critic_state": args.critic_state, **own}
+
         return [
             TrialSpec(
                 algorithm=algorithm,
+                variant_of=self.variants.get(algorithm, {}).get("algorithm", ""),
                 seed=seed,
                 env=self.env,
-                training={**self.training, "critic_state": args.critic_state},
+                training=training(algorithm),
                 env_config={**self.env_config, "horizon": args.train_horizon},
                 evaluation_env_config={"horizon": PAPER_HORIZON},
                 num_env_runners=args.num_env_runners,

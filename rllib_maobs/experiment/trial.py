@@ -35,7 +35,7 @@ class TrialSpec:
     """The settings of one trial, as plain values: Tune writes them to the trial's `params.json`.
 
     Attributes:
-        algorithm: Name of the algorithm.
+        algorithm: Name of the algorithm, or of a variant of one: the trial's name in tables.
         seed: Of the environments, the exploration noise and the initial weights.
         env: Registered name of the environment.
         training: Arguments of the config's `training()`.
@@ -45,6 +45,7 @@ class TrialSpec:
         torch_compile: Whether the update runs under `torch.compile`.
         steps_per_iteration: Env steps between evaluations.
         evaluation_duration: Episodes per evaluation.
+        variant_of: The algorithm, if `algorithm` names a variant of it.
     """
 
     algorithm: str
@@ -57,6 +58,7 @@ class TrialSpec:
     torch_compile: bool = True
     steps_per_iteration: int = 1000
     evaluation_duration: int = 10
+    variant_of: str = ""
 
     def build_config(self) -> AlgorithmConfig:
         """Return the algorithm's config.
@@ -66,7 +68,7 @@ class TrialSpec:
             on environments of its own.
         """
         return (
-            maobs.ALGORITHMS[self.algorithm]()
+            maobs.ALGORITHMS[self.variant_of or self.algorithm]()
             .environment(self.env, env_config=self.env_config)
             .env_runners(num_env_runners=self.num_env_runners, num_envs_per_env_runner=8)
             .training(**self.training)

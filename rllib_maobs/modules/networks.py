@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
@@ -110,17 +111,18 @@ class LSTMActor(nn.Module):
         Returns:
             The last h and c, `(..., H)` each.
         """
-        gates = self.from_observation(window)  # all steps at once
-        for t in range(window.shape[-2]):
-            here = gates[..., t, :]
-            if hidden is not None:
-                here = here + self.from_hidden(hidden[0])
+        weight = torch.cat([self.from_observation.weight, self.from_hidden.weight], -1)
+        for observation, counts in zip(window.unbind(-2), mask.unbind(-1), strict=True):
+            if hidden is None:
+                here = self.from_observation(observation)
+            else:
+                here = F.linear(torch.cat([observation, hidden[0]], -1), weight, self.from_observation.bias)
             i, f, g, o = here.chunk(4, dim=-1)
-            c = torch.sigmoid(i) * torch.tanh(g)
+            c = torch.sigmoid(i) * _tanh(g)
             if hidden is not None:
                 c = c + torch.sigmoid(f) * hidden[1]
-            h = torch.sigmoid(o) * torch.tanh(c)
-            valid = mask[..., t, None] > 0
+            h = torch.sigmoid(o) * _tanh(c)
+            valid = counts.unsqueeze(-1) > 0
             if hidden is None:
                 hidden = torch.where(valid, h, 0.0), torch.where(valid, c, 0.0)
             else:
@@ -136,6 +138,11 @@ class LSTMActor(nn.Module):
         """Maps windows `(..., T, O)` and masks `(..., T)` to actions `(..., A)` in [-1, 1], or to discrete values."""
         output = self.raw(window, mask, hidden)
         return output if self.discrete else torch.tanh(output)
+
+
+def _tanh(x: Tensor) -> Tensor:
+    """tanh by way of the sigmoid: compiled, torch's own takes three times as long."""
+    return 2.0 * torch.sigmoid(2.0 * x) - 1.0
 
 
 ACTORS: dict[str, type[MLPActor] | type[LSTMActor]] = {"mlp": MLPActor, "lstm": LSTMActor}
