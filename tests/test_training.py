@@ -126,11 +126,12 @@ def test_ppo_trains_without_a_warning(ray_session, complaints, scenario_id, opti
     assert not complaints()
 
 
-def test_maddpg_l_trains_without_a_warning(ray_session, complaints):
-    config = maddpg_l_config("simple-tunnel", horizon=10)
+@pytest.mark.parametrize(("scenario_id", "options"), [("simple-tunnel", {}), (PREY, {"prey": "learned"})])
+def test_maddpg_l_trains_without_a_warning(ray_session, complaints, scenario_id, options):
+    config = maddpg_l_config(scenario_id, horizon=10, **options)
     config.training(train_batch_size_per_learner=16, replay_buffer_capacity=1000)
     config.reporting(min_sample_timesteps_per_iteration=80)
-    check(train(config, steps=160), "simple-tunnel", ["agent_0", "agent_1", "agent_2"])
+    check(train(config, steps=160), scenario_id, make_scenario(scenario_id, **options).agents)
     assert not complaints()
 
 
@@ -144,12 +145,12 @@ def test_metrics_of_ppo_are_those_of_its_episodes(ray_session):
     assert result["episode_metrics"]["return_agent_0"] == pytest.approx(mean_agent)
 
 
-# The prey as an agent observes less than its predators.
-TASKS = [(scenario_id, {}) for scenario_id in METRICS] + [(PREY, {"prey": "flee"})]
+# A learned prey observes less than its predators.
+TASKS = [(scenario_id, {}) for scenario_id in METRICS] + [(PREY, {"prey": prey}) for prey in ("flee", "learned")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scenario_id", "options"), [*TASKS, (PREY, {"prey": "learned"})])
+@pytest.mark.parametrize(("scenario_id", "options"), TASKS)
 def test_ppo_trains_20_000_steps_without_a_warning(ray_session, complaints, scenario_id, options):
     results = train(ppo_config(scenario_id, **options), steps=20_000)
     check(results, scenario_id, make_scenario(scenario_id, **options).agents)
