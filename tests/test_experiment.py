@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 from ray.rllib.algorithms import Algorithm
 
+import rllib_maobs as maobs
 from rllib_maobs.envs import make_vec
 from rllib_maobs.experiment import Experiment, load_curves, plot_curves, summarise
 from rllib_maobs.experiment.arguments import make_parser, parse
@@ -325,33 +326,64 @@ def load_script(name: str) -> Any:
     return module
 
 
-@pytest.mark.parametrize(("agents", "batch"), [(3, 128), (6, 32), (9, 32)])
-def test_scripts_have_the_settings_of_the_paper(agents: int, batch: int) -> None:
-    experiment = load_script(f"spread{agents}a").experiment
-    assert experiment.name == f"spread-{agents}a"
-    assert experiment.algorithms == ("iddpg", "maddpg", "maddpg-l")
+FIVE = ("iddpg", "maddpg", "maddpg-lstm", "maddpg-l", "facmac")
+FOUR = FIVE[:4]
+
+
+@pytest.mark.parametrize(
+    ("script", "algorithms", "agents", "critic_lr", "batch", "seq_length"),
+    [
+        ("obstacle_predator_prey", FIVE, 3, 0.01, 256, 3),  # table III
+        ("spread3a", FIVE, 3, 0.01, 128, 5),  # table IV
+        ("spread6a", FIVE, 6, 0.01, 32, 3),  # table V
+        ("spread9a", FIVE, 9, 0.01, 32, 3),
+        ("tunnel", FIVE, 3, 0.01, 128, 5),  # table VI
+        ("simple_tunnel", FOUR, 3, 0.01, 128, 5),
+        ("simple_tunnel6a", FOUR, 6, 0.001, 32, 3),  # table VII
+        ("facmac_critic_source", ("own", "others", "shared"), 3, 0.01, 256, 3),  # figure 6
+        ("facmac_two_stage", ("two-stage", "facmac"), 3, 0.01, 256, 3),  # figure 7
+    ],
+)
+def test_scripts_have_the_settings_of_the_paper(
+    script: str, algorithms: tuple[str, ...], agents: int, critic_lr: float, batch: int, seq_length: int
+) -> None:
+    experiment = load_script(script).experiment
+    assert experiment.algorithms == algorithms
     assert experiment.stop_timesteps == 2_000_000
     parser = make_parser(experiment.name, experiment.algorithms, experiment.stop_timesteps)
     arguments = ["--train-horizon", "25", "--critic-state", "world", "--seeds", "5", "6", "--results-dir", "new"]
     specs = experiment.specs(parse(parser, experiment.name, arguments))
-    assert [(spec.algorithm, spec.seed) for spec in specs[:4]] == [
-        ("iddpg", 5),
-        ("maddpg", 5),
-        ("maddpg-l", 5),
-        ("iddpg", 6),
-    ]
-    for spec in specs[:3]:
+    count = len(algorithms)
+    assert [(spec.algorithm, spec.seed) for spec in specs] == [(a, s) for s in (5, 6) for a in algorithms]
+    for spec in specs[:count]:
         config = spec.build_config()
         config.validate()
+        assert config.name == (spec.algorithm if spec.algorithm in maobs.ALGORITHMS else "facmac")
         assert len(config.team.agents) == agents
-        assert (config.actor_lr, config.critic_lr, config.gamma) == (0.001, 0.01, 0.95)
-        assert config.train_batch_size_per_learner == batch
+        assert (config.actor_lr, config.critic_lr, config.gamma) == (0.001, critic_lr, 0.95)
+        assert (config.train_batch_size_per_learner, config.seq_length) == (batch, seq_length)
         assert (config.seed, config.critic_state, config.torch_compile_learner) == (5, "world", True)
         # Training episodes are short, evaluation is the paper's: 10 noise-free episodes of 100 steps.
         evaluation = config.get_evaluation_config_object()
         assert (config.env_config["horizon"], evaluation.env_config["horizon"]) == (25, 100)
         assert (config.explore, evaluation.explore) == (True, False)
         assert (config.evaluation_interval, config.evaluation_duration) == (1, 10)
+
+
+def test_variants_have_settings_of_their_own() -> None:
+    experiment = load_script("facmac_two_stage").experiment
+    parser = make_parser(experiment.name, experiment.algorithms, experiment.stop_timesteps)
+    for steps in (2_000_000, 3000):
+        arguments = ["--stop-timesteps", str(steps), "--results-dir", "new"]
+        two_stage, whole = experiment.specs(parse(parser, experiment.name, arguments))[:2]
+        assert two_stage.build_config().mixer_start == steps // 2
+        assert whole.build_config().mixer_start == 0
+    sources = load_script("facmac_critic_source").experiment
+    parser = make_parser(sources.name, sources.algorithms, sources.stop_timesteps)
+    for spec in sources.specs(parse(parser, sources.name, ["--results-dir", "new"])):
+        assert spec.build_config().critic_source == spec.algorithm
+    with pytest.raises(ValueError, match="Unknown algorithms 'madpg'; legal are iddpg, maddpg"):
+        Experiment(name="x", env="maobs/tunnel", algorithms=("a",), variants={"a": {"algorithm": "madpg"}}, training={})
 
 
 # --- A whole run --------------------------------------------------------------------------------------------------
@@ -392,7 +424,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     folder = tmp_path_factory.mktemp("run")
     results = folder / "results"
     command = [sys.executable, str(SCRIPTS / "spread3a.py"), "--results-dir", str(results)]
-    first = [*command, "--quick", "--stop-timesteps", str(STOP)]
+    first = [*command, "--quick", "--stop-timesteps", str(STOP), "--algos", "iddpg", "maddpg", "maddpg-l"]
     with subprocess.Popen(first, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             # The third result follows the checkpoint that is made with the second.
