@@ -25,6 +25,20 @@ ALGORITHMS: dict[str, type[JointConfig]] = {
 }
 """Every algorithm's configuration by its name."""
 
+
+def abilities_table() -> str:
+    """What every algorithm is defined for, as a Markdown table; the README's."""
+    lines = [
+        "| | actions | needs one team reward | agents may differ | LSTM | parameter sharing | twin critics (TD3) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, config in ALGORITHMS.items():
+        can = config.abilities
+        flags = (can.team_reward, can.different_agents, can.recurrent, can.parameter_sharing, can.twin_critics)
+        lines.append(f"| `{name}` | {', '.join(can.actions)} | {' | '.join('yes' if f else 'no' for f in flags)} |")
+    return "\n".join(lines)
+
+
 __all__ = [
     "ALGORITHMS",
     "FACMAC",
@@ -46,4 +60,5 @@ __all__ = [
     "MADDPGLSTMConfig",
     "QMIXConfig",
     "VDNConfig",
+    "abilities_table",
 ]

@@ -154,7 +154,15 @@ class Team:
 
 
 def shares_reward(env: JointEnv, steps: int = 25) -> bool:
-    """Whether all agents got the same reward at every one of some random steps."""
+    """Whether all agents always get the same reward: what the environment says, or else what random steps show.
+
+    Args:
+        env: The environment; one that has an attribute `shared_reward` other than None is asked and not stepped.
+        steps: How many steps to look at.
+    """
+    declared = getattr(env, "shared_reward", None)
+    if declared is not None:
+        return bool(declared)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     spaces = [env.action_spaces[agent] for agent in env.agents]
@@ -186,6 +194,7 @@ class WithAgentIds:
     def __init__(self, env: JointEnv) -> None:
         self._env = env
         self.num_envs, self.agents, self.action_spaces = env.num_envs, env.agents, env.action_spaces
+        self.shared_reward: bool | None = getattr(env, "shared_reward", None)
         zeros, ones = np.zeros(len(env.agents), np.float32), np.ones(len(env.agents), np.float32)
         self.observation_spaces: dict[str, gym.Space[Any]] = {
             agent: gym.spaces.Box(np.append(zeros, space.low), np.append(ones, space.high), dtype=np.float32)

@@ -155,6 +155,11 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
         return 4 + 2 * self.options.num_obstacles + 2 * (self.options.num_predators - 1) + 4
 
     @property
+    def shared_reward(self) -> bool:
+        """Predators share theirs; a learned prey is paid for the opposite."""
+        return self.options.prey != "learned"
+
+    @property
     def observation_sizes(self) -> Sequence[int]:
         """O of every agent."""
         n = self.options.num_predators

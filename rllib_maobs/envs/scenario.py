@@ -186,6 +186,15 @@ class Scenario(ABC, Generic[OptionsT]):
         """O, the length of one agent's observation; of the longest one where they differ."""
 
     @property
+    def shared_reward(self) -> bool | None:
+        """Whether all agents always get the same reward, which some algorithms need; None if that is not known.
+
+        An option `reward_mode` tells; a scenario without one may say it here.
+        """
+        mode = getattr(self.options, "reward_mode", None)
+        return None if mode is None else mode != "individual"
+
+    @property
     def observation_sizes(self) -> Sequence[int]:
         """Length of each agent's observation; shorter ones are padded with zeros to O in arrays (E, N, O)."""
         return [self.observation_size] * len(self.agents)

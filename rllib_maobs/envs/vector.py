@@ -63,6 +63,7 @@ class VectorEnv:
         padding = np.arange(scenario.observation_size) >= np.array(sizes)[:, None]
         self._padding: NDArray[np.bool_] | None = padding if padding.any() else None
         self.observation_spaces: dict[str, gym.Space[Any]] = dict(spaces)
+        self.shared_reward = scenario.shared_reward
         self.action_spaces = {agent: scenario.action_space() for agent in self.agents}
         action_shape: tuple[int, ...] = scenario.action_space().shape or ()
         self._actions_shape = (num_envs, n, *action_shape)

@@ -141,7 +141,7 @@ class LSTMActor(nn.Module):
 
 
 def _tanh(x: Tensor) -> Tensor:
-    """tanh by way of the sigmoid: compiled, torch's own takes three times as long."""
+    """Hyperbolic tangent by way of the sigmoid: compiled, torch's own takes three times as long."""
     return 2.0 * torch.sigmoid(2.0 * x) - 1.0
 
 

@@ -1,0 +1,280 @@
+"""Networks and RLModules: windows of LSTM actors, mixers, discrete actions; acting and learning are one computation."""
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.rl_module import RLModule
+from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
+from torch import nn
+
+import rllib_maobs as maobs
+from rllib_maobs.modules import Exploration, LSTMActor, Mixer
+from rllib_maobs.replay import JointReplayBuffer
+from rllib_maobs.runner import JointEnvRunner
+from tests.conftest import build_learner, random_columns, small_config
+
+O, A, H = 4, 2, 8  # noqa: E741
+
+
+@pytest.fixture
+def actor() -> LSTMActor:
+    torch.manual_seed(0)
+    return LSTMActor(O, A, (H, 6))
+
+
+def as_torch_lstm(actor: LSTMActor) -> nn.LSTM:
+    lstm = nn.LSTM(O, H, batch_first=True)
+    lstm.weight_ih_l0.data.copy_(actor.from_observation.weight)
+    lstm.bias_ih_l0.data.copy_(actor.from_observation.bias)
+    lstm.weight_hh_l0.data.copy_(actor.from_hidden.weight)
+    lstm.bias_hh_l0.data.zero_()
+    return lstm
+
+
+def test_one_observation_is_a_cell_from_zero(actor: LSTMActor) -> None:
+    obs = torch.randn(5, 1, O)
+    cell = nn.LSTMCell(O, H)
+    for mine, theirs in zip(cell.parameters(), as_torch_lstm(actor).parameters(), strict=True):
+        mine.data.copy_(theirs)
+    h, _ = cell(obs[:, 0])
+    torch.testing.assert_close(actor(obs, torch.ones(5, 1)), torch.tanh(actor.layers(h)))
+
+
+def test_a_window_longer_than_the_episode_is_a_full_unroll(actor: LSTMActor) -> None:
+    episode = torch.randn(5, 6, O)
+    _, (h, _) = as_torch_lstm(actor)(episode)
+    window = torch.cat([torch.randn(5, 3, O), episode], dim=1)
+    mask = (torch.arange(9) >= 3).float().expand(5, -1)
+    torch.testing.assert_close(actor(window, mask), torch.tanh(actor.layers(h[0])), rtol=1e-5, atol=1e-6)
+
+
+def test_what_lies_in_the_padding_changes_nothing(actor: LSTMActor) -> None:
+    """Neither the action nor the gradient, and a masked window equals a shorter one."""
+    window, mask = torch.randn(5, 6, O), (torch.arange(6) >= 2).float().expand(5, -1)
+    other = window.clone()
+    other[:, :2] = 1e6
+    results = []
+    for seen, counts in ((window, mask), (other, mask), (window[:, 2:], mask[:, 2:])):
+        action = actor(seen, counts)
+        results.append((action, *torch.autograd.grad(action.sum(), list(actor.parameters()))))
+    for changed in results[1:]:
+        for x, y in zip(results[0], changed, strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-6)
+
+
+def test_a_carried_state_goes_on(actor: LSTMActor) -> None:
+    """Two windows, the second from the first one's h and c, are one long window."""
+    window, mask = torch.randn(5, 6, O), torch.ones(5, 6)
+    hidden = actor.unroll(window[:, :4], mask[:, :4])
+    torch.testing.assert_close(actor(window[:, 4:], mask[:, 4:], hidden), actor(window, mask))
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
+def test_the_action_taken_is_the_learners_recomputation(ray_session: None, algorithm: str) -> None:
+    """From the runner through replay to the learner: the same windows, the same actions, to 1e-6."""
+    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4)
+    learner = build_learner(config)
+    runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    runner.share(learner.acting, None)
+    team = config.team
+    buffer = JointReplayBuffer(400, len(team.agents), team.observation_size, team.action_size, seed=0)
+    for length in (3, 20, 31):
+        (sample,) = runner.sample(num_timesteps=2 * length, explore=False)
+        buffer.add(**vars(sample))
+    columns = buffer.sample((300,), gamma=0.9, seq_length=4)
+    assert set(columns["mask"].sum(1).tolist()) == {1.0, 2.0, 3.0, 4.0}
+    batch = learner.prepare(columns, {})
+    with torch.no_grad():
+        outputs = learner.acting(learner.acting.params, (batch.history[0], 1), (batch.history[1], None))
+    if team.discrete:
+        assert torch.equal(outputs.argmax(-1), batch.actions.argmax(-1))
+    else:
+        torch.testing.assert_close(outputs, batch.actions, rtol=0, atol=1e-6)
+
+
+def test_windows_do_not_cross_a_reset_in_acting(ray_session: None) -> None:
+    """At an episode's first step the actor sees that observation alone, also when the runner starts over."""
+    config = small_config("maddpg-lstm", horizon=5)
+    config.validate()
+    runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    (sample,) = runner.sample(num_timesteps=2 * 8, explore=False)
+    (again,) = runner.sample(num_episodes=2, explore=False)
+    stack, alone = runner.actors, torch.ones(2, 1)
+    for part, step in ((sample, 0), (sample, 5), (again, 0)):
+        first = torch.from_numpy(part.obs[step])[:, :, None]  # (E, N, T = 1, O)
+        want = stack(stack.params, (first, 1), (alone, None))
+        np.testing.assert_allclose(part.actions[step], want.detach().numpy(), atol=1e-6)
+
+
+def test_the_lstm_module_works_in_rllibs_own_runner(ray_session: None) -> None:
+    """The same actions there as by hand, with the window as the module's state from step to step."""
+    config = small_config("maddpg-lstm", horizon=7)
+    config.validate()
+    config.env_runner_cls = MultiAgentEnvRunner
+    runner = MultiAgentEnvRunner(config=config, worker_index=0)
+    episodes = runner.sample(num_episodes=2, explore=False)
+    module = runner.module["agent_1"]
+    for episode in episodes:
+        agent = episode.agent_episodes["agent_1"]
+        state = {k: v[None] for k, v in module.get_initial_state().items()}
+        for t in range(7):
+            out = module.forward_inference({"obs": agent.get_observations(t)[None], "state_in": state})
+            np.testing.assert_allclose(agent.get_actions(t), out["actions"][0].numpy(), atol=1e-5)
+            state = out["state_out"]
+    assert runner.sample(num_timesteps=4, explore=True)
+
+
+def test_an_lstm_module_asks_for_its_state(ray_session: None) -> None:
+    learner = build_learner(small_config("maddpg-lstm"))
+    with pytest.raises(ValueError, match=r'give its state as batch\["state_in"\], get_initial_state\(\)'):
+        learner.module["agent_0"].forward_inference({"obs": np.zeros((1, 18), np.float32)})
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
+def test_discrete_modules_act_in_both_runners(ray_session: None, algorithm: str) -> None:
+    """The best action when they do not explore; drawn from the softmax, or epsilon-greedily, when they do."""
+    config = small_config(algorithm, horizon=6, action_mode="discrete")
+    config.validate()
+    joint = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    (sample,) = joint.sample(num_timesteps=12, explore=False)
+    assert set(np.unique(sample.actions)) == {0.0, 1.0} and (sample.actions.sum(-1) == 1).all()
+    values = joint.actors(joint.actors.params, (torch.from_numpy(sample.obs[2]), 1))
+    assert np.array_equal(values.argmax(-1).numpy(), sample.actions[2].argmax(-1))
+    (random,) = joint.sample(num_timesteps=2000, random_actions=True)
+    np.testing.assert_allclose(random.actions.mean((0, 1, 2)), 0.2, atol=0.03)
+    config.env_runner_cls = MultiAgentEnvRunner
+    stock = MultiAgentEnvRunner(config=config, worker_index=0)
+    agent = stock.sample(num_episodes=1, explore=False)[0].agent_episodes["agent_1"]
+    module = stock.module["agent_1"]
+    want = module.forward_inference({"obs": np.asarray(agent.get_observations(slice(0, 6)))})[Columns.ACTIONS]
+    assert want.tolist() == np.asarray(agent.get_actions()).tolist()
+    assert stock.sample(num_timesteps=4, explore=True)
+
+
+def test_discrete_exploration() -> None:
+    values = torch.tensor([1.0, 3.0, 2.0, -torch.inf]).expand(20_000, -1)
+    generator = torch.Generator().manual_seed(0)
+
+    def shares(exploration: Exploration, sample: bool) -> list[float]:
+        drawn = exploration.discrete(values, 0, generator, sample=sample)
+        return (torch.bincount(drawn, minlength=4) / len(drawn)).tolist()
+
+    third = 0.3 / 3
+    assert shares(Exploration(epsilon=0.3), False) == pytest.approx([third, 0.7 + third, third, 0], abs=0.01)
+    softmax = torch.softmax(values[0], 0).tolist()
+    assert shares(Exploration(epsilon=0.0), True) == pytest.approx(softmax, abs=0.01)
+
+
+def mixers(monotone: bool) -> tuple[Mixer, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    generator = torch.Generator().manual_seed(1)
+    q, state = torch.randn(500, 3, generator=generator), torch.randn(500, 5, generator=generator)
+    return Mixer(3, 5, hidden_size=8, monotone=monotone).double(), q.double(), state.double()
+
+
+def test_qmix_rises_with_every_agents_value_and_facmac_need_not() -> None:
+    """Finite differences over random states and values."""
+    for monotone in (True, False):
+        mixer, q, state = mixers(monotone)
+        slopes = torch.stack([mixer(q + 1e-5 * unit, state) - mixer(q, state) for unit in torch.eye(3).double()])
+        assert (slopes >= 0).all() == monotone
+        assert slopes.max() > 0
+        assert (slopes.min() < -1e-7) != monotone
+
+
+def test_each_agents_best_action_is_the_teams_for_qmix_and_vdn_only() -> None:
+    """Over all joint actions of three agents with three actions each."""
+    generator = torch.Generator().manual_seed(2)
+    values = torch.randn(200, 3, 3, generator=generator).double()  # (states, agents, actions)
+    joint = torch.cartesian_prod(*[torch.arange(3)] * 3)  # (27, 3)
+    chosen = torch.stack([values[:, a, joint[:, a]] for a in range(3)], dim=-1)  # (states, 27, agents)
+    own = values.argmax(-1)
+    agree = {}
+    for name in ("vdn", "qmix", "facmac"):
+        mixer, _, state = mixers(name == "qmix")
+        total = chosen.sum(-1) if name == "vdn" else mixer(chosen, state[:200, None].expand(-1, 27, -1))
+        agree[name] = (joint[total.argmax(1)] == own).all(1)
+    assert agree["vdn"].all() and agree["qmix"].all()
+    assert not agree["facmac"].all()
+
+
+def test_vdn_is_the_plain_sum(ray_session: None) -> None:
+    learner = build_learner(small_config("vdn"))
+    q = torch.randn(7, 3)
+    torch.testing.assert_close(learner.total({}, q, torch.zeros(7, 1)), q[:, :1] + q[:, 1:2] + q[:, 2:])
+
+
+@pytest.mark.parametrize(("algorithm", "shared"), [("maddpg-lstm", False), ("facmac", True), ("qmix", True)])
+def test_every_kind_of_module_leaves_its_checkpoint(ray_session: None, tmp_path, algorithm: str, shared: bool) -> None:
+    """Each acts alone; shared parameters are there once; the mixer is a module of its own."""
+    config = small_config(algorithm)
+    if shared:
+        config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *a, **k: "all")
+    algo = config.build_algo()
+    algo.train()
+    folder = f"{algo.save_to_path(tmp_path / 'checkpoint')}/learner_group/learner/rl_module"
+    names = ["all"] if shared else ["agent_0", "agent_1", "agent_2"]
+    assert sorted(
+        p.name for p in (tmp_path / "checkpoint/learner_group/learner/rl_module").iterdir() if p.is_dir()
+    ) == ([*names, "mixer"] if algorithm in ("facmac", "qmix") else names)
+    for name in names:
+        module, trained = RLModule.from_checkpoint(f"{folder}/{name}"), algo.get_module(name)
+        obs = np.random.default_rng(0).normal(size=(3, 18)).astype(np.float32)
+        state = {k: v.expand(3, *v.shape) for k, v in module.get_initial_state().items()}
+        got, want = (m.forward_inference({"obs": obs, "state_in": state})["actions"] for m in (module, trained))
+        assert torch.equal(got, want)
+    parameters = sum(p.numel() for p in algo._learner.module[names[0]].parameters())
+    stacked = sum(
+        s.flat.numel() for r, s in (*algo._learner._roles.items(), *algo._learner._targets.items()) if r != "mixer"
+    )
+    if algorithm != "facmac" or shared:
+        assert parameters * len(names) == stacked
+    algo.stop()
+
+
+def test_normalised_observations_survive_a_checkpoint(ray_session: None, tmp_path) -> None:
+    config = small_config("maddpg").training(normalize_observations=True)
+    algo = config.build_algo()
+    algo.train()
+    path = algo.save_to_path(tmp_path / "checkpoint")
+    module = RLModule.from_checkpoint(f"{path}/learner_group/learner/rl_module/agent_1")
+    seen = algo.replay_buffer._columns["obs"][: len(algo.replay_buffer), 1]
+    assert module.normalizer.count.item() == 40
+    torch.testing.assert_close(module.normalizer.mean, algo._learner.module["agent_1"].normalizer.mean)
+    assert (module.normalizer.mean - seen.mean(0)).abs().max() < 0.2
+    restored = maobs.MADDPG.from_checkpoint(path)
+    first, second = algo.train(), restored.train()
+    assert first["env_runners"]["num_env_steps_sampled"] == second["env_runners"]["num_env_steps_sampled"]
+    assert torch.equal(algo._learner.normalizers.flat, restored._learner.normalizers.flat)
+    assert restored.env_runner.normalizers.flat.data_ptr() == restored._learner.normalizers.flat.data_ptr()
+    algo.stop()
+    restored.stop()
+
+
+def test_random_numbers_of_the_losses_survive_a_checkpoint(ray_session: None, tmp_path) -> None:
+    """Smoothed targets and Gumbel draws go on where they were, and so does the delay of the actors."""
+    config = small_config("maddpg").training(twin_critics=True, target_noise=0.2, policy_delay=2)
+    algo = config.build_algo()
+    algo.train()
+    restored = maobs.MADDPG.from_checkpoint(algo.save_to_path(tmp_path / "checkpoint"))
+    algo.train()
+    restored.train()
+    for role, stack in algo._learner._roles.items():
+        assert torch.equal(stack.flat, restored._learner._roles[role].flat)
+    algo.stop()
+    restored.stop()
+
+
+def test_columns_of_the_tests_are_those_of_replay(ray_session: None) -> None:
+    """The random columns that the learner's tests use have the names and shapes that replay gives."""
+    for algorithm in ("maddpg", "maddpg-lstm", "qmix"):
+        config = small_config(algorithm).training(critic_state="world")
+        algo = config.build_algo()
+        algo.train()
+        seq_length = 3 if config.actor == "lstm" else 0
+        columns = algo.replay_buffer.sample((32,), gamma=0.9, seq_length=seq_length)
+        made = random_columns(algo.config, size=32)
+        made.pop("noise")
+        assert {k: v.shape for k, v in columns.items()} == {k: v.shape for k, v in made.items()}
+        algo.stop()
