@@ -4,8 +4,9 @@ The dynamics are those of OpenAI's multi-agent particle environments (MPE). Ever
 contacts amplify rounding errors; only observations are float32.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -78,10 +79,33 @@ class Physics:
 
 PHYSICS: dict[str, Physics] = {
     "mpe": Physics(),
-    # Stiffer, in shorter steps: bodies head-on at the scenarios' speed limits bounce; in "mpe" they pass through each
-    # other. Small ones without a limit may still be fast enough to pass (radius 0.075, speeds of 2.8 each).
+    # Stiffer, in shorter steps: bodies that in "mpe" pass through each other bounce; see `_solid` for fast ones.
     "solid": Physics(contact_force=500.0, substeps=5),
 }
+
+
+def _solid(groups: Sequence[Bodies]) -> Physics:
+    """The solid physics, made stiffer where bodies are so fast and small that it would not stop them.
+
+    Two bodies that meet head-on must stop before their centres do: while these close in from r to 0, each moves r / 2,
+    and the contact force takes k r^2 / 4 from it. That must be more than the m v^2 / 2 it brings along at top speed;
+    half as much again is for the thrust that goes on. More steps keep a stiffer contact stable.
+    """
+    physics = PHYSICS["solid"]
+    moving = [group for group in groups if group.movable and group.collides]
+    # Where full diagonal thrust and damping are in balance, or at the speed limit.
+    speeds = [math.sqrt(2.0) * g.accel * physics.dt / physics.damping / physics.mass for g in moving]
+    speeds = [min(s, math.inf if g.max_speed is None else g.max_speed) for s, g in zip(speeds, moving, strict=True)]
+    if not moving or max(speeds) == 0.0:
+        return physics
+    contact = min(g.radius for g in moving) + min(g.radius for g in groups if g.collides)
+    needed = 1.5 * physics.mass * (2.0 * max(speeds) / contact) ** 2 / 2.0
+    stiffer = max(1.0, needed / physics.contact_force)
+    return replace(
+        physics,
+        contact_force=physics.contact_force * stiffer,
+        substeps=math.ceil(physics.substeps * math.sqrt(stiffer)),
+    )
 
 
 class World:
@@ -125,7 +149,7 @@ class World:
         self.num_envs = num_envs
         self.groups = tuple(groups)
         self.walls = tuple(walls)
-        self.physics = PHYSICS[physics]
+        self.physics = _solid(self.groups) if physics == "solid" else PHYSICS[physics]
         self.integrator = integrator
 
         ends = np.cumsum([group.count for group in groups]).tolist()
