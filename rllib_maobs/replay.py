@@ -191,8 +191,10 @@ class JointReplayBuffer(Checkpointable):
         for _ in range(n_step - 1):
             ahead = self._next[last] % self.capacity
             more = self._next[ahead] != _NONE
-            factor = torch.from_numpy(np.where(more, gamma**steps, 0.0).astype(np.float32)).to(rewards.device)
-            total += factor[:, None] * rewards.index_select(0, self._places(ahead))
+            factor = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None]
+            # A row without a successor may have no reward at all: its memory is not even zero.
+            further = factor * rewards.index_select(0, self._places(ahead))
+            total += torch.where(self._places(more)[:, None], further, 0.0)
             last, steps = np.where(more, ahead, last), steps + more
         following = self._next[last] % self.capacity
         ended = self._columns["terminated"].index_select(0, self._places(last))
@@ -213,7 +215,7 @@ class JointReplayBuffer(Checkpointable):
                 batch[f"{prefix}state"] = self._take("state", places, shape)
         return batch
 
-    def _places(self, rows: NDArray[np.int64]) -> Tensor:
+    def _places(self, rows: NDArray[Any]) -> Tensor:
         return torch.from_numpy(rows.reshape(-1)).to(self._columns["obs"].device)
 
     def _take(self, name: str, rows: NDArray[np.int64], shape: Sequence[int]) -> Tensor:

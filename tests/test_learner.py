@@ -246,6 +246,7 @@ COMPILED = [*ALGORITHMS, "facmac own", "td3", "shared", "clipped", "normalised",
 
 
 @pytest.mark.parametrize("case", COMPILED)
+@pytest.mark.usefixtures("double_precision")
 def test_compiled_equals_eager_over_many_updates(make_learner: MakeLearner, case: str) -> None:
     def config() -> maobs.JointConfig:
         if case in ALGORITHMS:
@@ -272,8 +273,8 @@ def test_compiled_equals_eager_over_many_updates(make_learner: MakeLearner, case
                 learner.observe(columns["window"].numpy())
         eager_report, compiled_report = eager.step(columns), compiled.step(columns)
     assert compiled._compiled and not eager._compiled
-    torch.testing.assert_close(compiled_report, eager_report, rtol=5e-3, atol=5e-3)
-    torch.testing.assert_close(compiled.acting.flat, eager.acting.flat, rtol=1e-2, atol=5e-3)
+    torch.testing.assert_close(compiled_report, eager_report, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(compiled.acting.flat, eager.acting.flat, rtol=1e-6, atol=1e-8)
 
 
 def test_learners_of_one_process_do_not_share_compiled_code(make_learner: MakeLearner) -> None:

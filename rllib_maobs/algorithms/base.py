@@ -26,6 +26,7 @@ from ray.rllib.utils.metrics import (
     SYNCH_WORKER_WEIGHTS_TIMER,
     TIMERS,
 )
+from ray.util import log_once
 
 from rllib_maobs.envs.joint import REWARD_TOLERANCE, Team, shares_reward
 from rllib_maobs.learner import MIXER, JointLearner
@@ -265,6 +266,8 @@ class JointConfig(AlgorithmConfig):
             legal = "twin_critics=False, target_noise=0.0 and policy_delay=1"
             raise ValueError(f"{self.name} is not defined with TD3's options; legal are {legal}.")
         self._inspect_environment()
+        # RLlib would say, once, that its old API stack is a choice, too; here it is none.
+        log_once(f"{(self.algo_class or JointAlgorithm).__name__}_on_new_api_stack")
         super().validate()
 
     def _validate_numbers(self) -> None:
