@@ -48,7 +48,8 @@ from ray.rllib.utils.metrics import (
 )
 from ray.tune.registry import ENV_CREATOR, _global_registry
 
-from rllib_maobs.envs.joint import JointEnv, Team, WithAgentIds, make_joint_env, register_envs, snapshot
+from rllib_maobs.envs.joint import WithAgentIds, make_joint_env, register_envs, snapshot
+from rllib_maobs.envs.team import JointEnv, Team
 from rllib_maobs.modules import AgentModule, Stack
 from rllib_maobs.modules.agent import push
 

@@ -1,6 +1,7 @@
 """One file per algorithm: its configuration, what it is defined for, and its losses."""
 
-from rllib_maobs.algorithms.base import Abilities, JointAlgorithm, JointConfig
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import Abilities, JointConfig
 from rllib_maobs.algorithms.facmac import FACMAC, FACMACConfig
 from rllib_maobs.algorithms.iddpg import IDDPG, IDDPGConfig
 from rllib_maobs.algorithms.iql import IQL, IQLConfig

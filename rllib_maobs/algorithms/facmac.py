@@ -8,7 +8,8 @@ from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import Abilities, JointAlgorithm, JointConfig, in_range, one_of
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import Abilities, JointConfig, in_range, one_of
 from rllib_maobs.learner import Batch, JointLearner, Nets
 from rllib_maobs.modules import Params
 

@@ -9,7 +9,8 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import Abilities, JointAlgorithm, JointConfig
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import Abilities, JointConfig
 from rllib_maobs.learner import Batch, JointLearner, Nets
 from rllib_maobs.modules import Params, Stack, UtilityModule
 

@@ -8,7 +8,8 @@ from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import JointAlgorithm, JointConfig, one_of
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import JointConfig, one_of
 from rllib_maobs.learner import Batch, JointLearner, Nets
 
 OTHER_AGENTS_ACTIONS = ("replay", "current", "joint")

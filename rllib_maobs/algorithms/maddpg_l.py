@@ -5,7 +5,8 @@ from __future__ import annotations
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import JointAlgorithm, JointConfig
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.learner import Batch, JointLearner, Nets
 
 

@@ -8,7 +8,8 @@ from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import Abilities, JointAlgorithm, in_range
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import Abilities, in_range
 from rllib_maobs.algorithms.iql import IQLConfig, QLearner
 from rllib_maobs.learner import JointLearner
 from rllib_maobs.modules import Params

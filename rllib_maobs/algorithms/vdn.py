@@ -5,7 +5,8 @@ from __future__ import annotations
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
-from rllib_maobs.algorithms.base import Abilities, JointAlgorithm
+from rllib_maobs.algorithms.base import JointAlgorithm
+from rllib_maobs.algorithms.config import Abilities
 from rllib_maobs.algorithms.iql import IQLConfig, QLearner
 from rllib_maobs.learner import JointLearner
 from rllib_maobs.modules import Params
