@@ -124,6 +124,11 @@ def measure(algorithm: str, shape: str, critic_state: str, rounds: int, seconds:
     }
 
 
+def shown(value: float, digits: int) -> str:
+    """A number, or a dash where there is nothing to compare with."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
 def main() -> None:
     """Prints the table; exits with 1 if a ratio is below its bar."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -143,8 +148,8 @@ def main() -> None:
         for shape, (*_, least, share) in SHAPES.items():
             r = measure(algorithm, shape, arguments.critic_state, arguments.rounds, arguments.seconds)
             print(
-                f"| {algorithm} | {shape} | {r['loop']:.0f} | {r['eager']:.0f} | {r['compiled']:.0f} "
-                f"| {r['end to end']:.0f} | {r['compiled/loop']:.1f} | {r['compiled/maddpg']:.2f} "
+                f"| {algorithm} | {shape} | {shown(r['loop'], 0)} | {r['eager']:.0f} | {r['compiled']:.0f} "
+                f"| {r['end to end']:.0f} | {shown(r['compiled/loop'], 1)} | {r['compiled/maddpg']:.2f} "
                 f"| {r['end to end/compiled']:.2f} |",
                 flush=True,
             )
