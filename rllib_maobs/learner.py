@@ -80,9 +80,9 @@ class JointLearner(TorchLearner):
         self._sum: Tensor | None = None
         self._updates = self._whole_updates = 0
         self._updates_lifetime = 0
-        # What the losses may depend on but for tensors: each combination is compiled on its own.
+        # What an update may depend on but for numbers in tensors: each combination is compiled on its own.
         self.stage = ""
-        self._compiled: dict[tuple[str, bool], Callable[..., Any]] = {}
+        self._compiled: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._with_actors = self.has_actors
 
     @override(TorchLearner)
@@ -94,6 +94,7 @@ class JointLearner(TorchLearner):
         config, team = self.config, self.config.team
         modules = [self.module[mid].unwrapped() for mid in config.module_ids]
         self._roles, self._targets = self.stacks(modules)
+        self._optimizer_of: dict[str, torch.optim.Adam] = {}
         self.normalizers = Stack([m.normalizer for m in modules]) if config.normalize_observations else None
         for role, trained, lr in (
             ("critic", ("critic", "mixer"), config.critic_lr),
@@ -101,13 +102,22 @@ class JointLearner(TorchLearner):
         ):
             parameters = [self._roles[name].flat for name in trained if name in self._roles]
             if parameters:
+                optimizer = torch.optim.Adam(parameters)
+                for flat in parameters:
+                    optimizer.state[flat] = {
+                        "step": torch.zeros((), device=flat.device),
+                        "exp_avg": torch.zeros_like(flat),
+                        "exp_avg_sq": torch.zeros_like(flat),
+                    }
                 self.register_optimizer(
                     module_id=ALL_MODULES,
                     optimizer_name=role,
-                    optimizer=torch.optim.Adam(parameters, fused=True),
+                    optimizer=optimizer,
                     params=parameters,
                     lr_or_lr_schedule=lr,
                 )
+                self._optimizer_of |= {name: optimizer for name in trained if name in self._roles}
+        self._bind()
         # Constants of the losses, and the random numbers that they need, drawn outside of what is compiled.
         device = self._device
         mask = torch.from_numpy(team.action_mask).to(device)
@@ -120,6 +130,14 @@ class JointLearner(TorchLearner):
         if self.has_actors:
             self._draw = torch.rand if team.discrete else torch.randn if config.target_noise else None
         self._generator = torch.Generator().manual_seed(config.seed or 0)
+
+    def _bind(self) -> None:
+        """Adam's tensors of each role, piece by piece: parameters, running means, running squares, steps."""
+        self._adam = {}
+        for role, stack in self._roles.items():
+            state = self._optimizer_of[role].state[stack.flat]
+            pieces = [stack.pieces(t) for t in (stack.flat.detach(), state["exp_avg"], state["exp_avg_sq"])]
+            self._adam[role] = (*pieces, [state["step"]] * len(pieces[0]))
 
     def stacks(self, modules: list[Any]) -> tuple[dict[str, Stack], dict[str, Stack]]:
         """Stacks every agent's networks.
@@ -210,12 +228,7 @@ class JointLearner(TorchLearner):
         Returns:
             `(B, N, H)`.
         """
-        if state.dim() == 3:
-            return self.critics(critic, (state, 1), method="encode")
-        # One state for all: one wide matrix product instead of N narrow ones.
-        weight = critic["from_state.weight"]  # (rows, H, S)
-        encoded = F.linear(state, weight.flatten(0, 1)).unflatten(-1, weight.shape[:2])
-        return self.critics.spread(encoded, dim=1)
+        return self.critics(critic, (state, 1 if state.dim() == 3 else None), method="encode")
 
     def q(self, critic: Params, encoded: Tensor, actions: Tensor) -> Tensor:
         """Every agent's Q_i.
@@ -341,8 +354,8 @@ class JointLearner(TorchLearner):
 
     def _gradients(
         self, nets: Nets, target: Nets, normalizer: Params, columns: Columns
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """All roles' gradients as flat vectors, and the report: losses and Q of every agent, `(3, N)`."""
+    ) -> tuple[dict[str, list[Tensor]], Tensor]:
+        """All roles' gradients and the report."""
         batch = self.prepare(columns, normalizer)
 
         def critic_loss(critic: Params, mixer: Params) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor | tuple[()]]]:
@@ -362,21 +375,42 @@ class JointLearner(TorchLearner):
         gradients, (_, (critic_losses, q, encoded)) = grad_and_value(critic_loss, argnums=(0, 1), has_aux=True)(
             nets.critic, nets.mixer
         )
-        flat = {"critic": self._flat("critic", gradients[0])}
+        by_role = {"critic": self._clipped("critic", gradients[0])}
         if self.trains_mixer:
-            flat["mixer"] = self._flat("mixer", gradients[1])
+            by_role["mixer"] = self._clipped("mixer", gradients[1])
         report = [critic_losses, q.mean(0)]
         if self._with_actors:
             gradient, (_, actor_losses) = grad_and_value(actor_loss, has_aux=True)(nets.actor)
-            flat["actor"] = self._flat("actor", gradient)
+            by_role["actor"] = self._clipped("actor", gradient)
             report.append(actor_losses)
         elif self.has_actors:
             report.append(torch.zeros_like(critic_losses))
         agents = len(self.config.team.agents)
-        return flat, torch.stack([values.expand(agents) for values in report])
+        return by_role, torch.stack([values.expand(agents) for values in report])
 
-    def _flat(self, role: str, gradient: Params) -> Tensor:
-        """One role's gradient as a flat vector, clipped for every network on its own if so configured."""
+    def gradients(self, columns: Columns, *, with_actors: bool | None = None) -> tuple[dict[str, list[Tensor]], Tensor]:
+        """All roles' gradients of one minibatch, and the report; compiled if so configured.
+
+        Args:
+            columns: The minibatch.
+            with_actors: Whether those of the actors, too; None if the algorithm has actors.
+
+        Returns:
+            Gradients of "critic", "mixer" and "actor" (those that there are), in the pieces of their stacks, and, for
+            every agent, the critic's loss, mean Q and the actor's loss, `(3, N)`; `(2, N)` if there are no actors.
+        """
+        self._with_actors = self.has_actors if with_actors is None else with_actors
+        normalizer = {} if self.normalizers is None else self.normalizers.params
+        arguments = self.nets(), self.nets(target=True), normalizer, columns
+        if not self.config.torch_compile_learner:
+            return self._gradients(*arguments)
+        key = (self.stage, self._with_actors, len(columns["rewards"]))
+        if key not in self._compiled:
+            self._compiled[key] = self._compile()
+        return self._compiled[key](*arguments)
+
+    def _clipped(self, role: str, gradient: Params) -> list[Tensor]:
+        """One role's gradient in pieces, clipped for every network on its own if so configured."""
         limit, by = self.config.grad_clip, self.config.grad_clip_by
         if limit is not None and by == "value":
             gradient = {name: g.clamp(-limit, limit) for name, g in gradient.items()}
@@ -390,38 +424,21 @@ class JointLearner(TorchLearner):
             }
         return self._roles[role].flatten(gradient)
 
-    def gradients(self, columns: Columns, *, with_actors: bool | None = None) -> tuple[dict[str, Tensor], Tensor]:
-        """All roles' gradients of one minibatch as flat vectors, and the report; compiled if so configured.
-
-        Args:
-            columns: The minibatch.
-            with_actors: Whether those of the actors, too; None if the algorithm has actors.
-
-        Returns:
-            Gradients of "critic", "mixer" and "actor" (those that there are) and, for every agent, the critic's
-            loss, mean Q and the actor's loss, `(3, N)`; `(2, N)` if the algorithm has no actors.
-        """
-        nets, target = self.nets(), self.nets(target=True)
-        normalizer = {} if self.normalizers is None else self.normalizers.params
-        self._with_actors = self.has_actors if with_actors is None else with_actors
-        if not self.config.torch_compile_learner:
-            return self._gradients(nets, target, normalizer, columns)
-        key = (self.stage, self._with_actors)
-        if key not in self._compiled:
-            # Code of its own: compiled code is kept per code object, and what is not a tensor is not checked.
-            own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
-            mode = self.config.torch_compile_learner_dynamo_mode
-            self._compiled[key] = torch.compile(
-                MethodType(own, self),
-                fullgraph=True,
-                dynamic=False,
-                backend=self.config.torch_compile_learner_dynamo_backend,
-                mode=mode,
-                # Nothing but the tensors changes between calls, so nothing else need be checked at every one.
-                options=None if mode else {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
-            )
-        result: tuple[dict[str, Tensor], Tensor] = self._compiled[key](nets, target, normalizer, columns)
-        return result
+    def _compile(self) -> Callable[..., Any]:
+        """`_gradients` as compiled code."""
+        # Code of its own: compiled code is kept per code object, and not checked against what has changed.
+        own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
+        mode = self.config.torch_compile_learner_dynamo_mode
+        compiled: Callable[..., Any] = torch.compile(
+            MethodType(own, self),
+            fullgraph=True,
+            dynamic=False,
+            backend=self.config.torch_compile_learner_dynamo_backend,
+            mode=mode,
+            # `gradients` compiles anew for whatever changes between calls, so nothing need be checked at every one.
+            options=None if mode else {"cpp_wrapper": True, "guard_filter_fn": torch.compiler.skip_all_guards_unsafe},
+        )
+        return compiled
 
     def nets(self, *, target: bool = False) -> Nets:
         """All roles' parameters, or those of their targets."""
@@ -444,14 +461,34 @@ class JointLearner(TorchLearner):
         gradients, report = self.gradients(columns, with_actors=whole and self.has_actors)
         self._updates_lifetime += 1
         self._whole_updates += whole
-        for role, stack in self._roles.items():
-            stack.flat.grad = gradients.get(role)  # Adam leaves alone what has none
-        for optimizer in ("critic", "actor") if "actor" in gradients else ("critic",):
-            self.get_optimizer(ALL_MODULES, optimizer).step()
+        for role, gradient in gradients.items():
+            self._adam_step(role, gradient)
         if whole:
             for role, stack in self._roles.items():
                 self._targets[role].flat.lerp_(stack.flat, self.config.tau)
         return report
+
+    def _adam_step(self, role: str, gradient: list[Tensor]) -> None:
+        """One step of a role's Adam, on the pieces as they come: `optimizer.step()` wants them copied into one."""
+        parameters, means, squares, steps = self._adam[role]
+        steps[0].add_(1.0)
+        group = self._optimizer_of[role].param_groups[0]
+        beta1, beta2 = group["betas"]
+        torch._fused_adam_(
+            parameters,
+            gradient,
+            means,
+            squares,
+            [],
+            steps,
+            lr=group["lr"],
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=0.0,
+            eps=group["eps"],
+            amsgrad=False,
+            maximize=False,
+        )
 
     @override(Learner)
     def update(
@@ -537,6 +574,7 @@ class JointLearner(TorchLearner):
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state."""
         super().set_state(state)
+        self._bind()  # the optimisers' tensors are new ones
         if _PROGRESS in state:
             self._updates_lifetime = state[_PROGRESS]["updates"]
             self._generator.set_state(torch.from_numpy(state[_PROGRESS]["generator"]))

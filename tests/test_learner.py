@@ -44,9 +44,9 @@ def with_state(learner: JointLearner, columns: Columns) -> Columns:
     return columns | {k: columns[k[:-5] + "obs"].flatten(1) for k in ("state", "next_state")}
 
 
-def per_network(flat: torch.Tensor, stack: Any) -> list[list[torch.Tensor]]:
-    """A flat vector of a stack as a list of parameters for each distinct network, cut to its own sizes."""
-    params = stack.unflatten(flat)
+def per_network(pieces: list[torch.Tensor], stack: Any) -> list[list[torch.Tensor]]:
+    """A stack's gradient as a list of parameters for each distinct network, cut to its own sizes."""
+    params = stack.unflatten(torch.cat(pieces))
     result = []
     for row in range(max(stack.rows) + 1):
         network = stack.networks[stack.rows.index(row)]
@@ -132,8 +132,8 @@ def compare(learner: JointLearner, columns: Columns, stage: str = "") -> None:
             expected = losses if len(losses) == agents else losses * agents
             assert report[row].tolist() == pytest.approx(expected, rel=1e-8)
     assert set(got) == {role for role in ("actor", "critic", "mixer") if role in want}
-    for role, flat in got.items():
-        networks = per_network(flat, learner._roles[role])
+    for role, gradient in got.items():
+        networks = per_network(gradient, learner._roles[role])
         assert len(networks) == len(want[role])
         for network_got, network_want in zip(networks, want[role], strict=True):
             assert max(g.abs().max() for g in network_want) > 1e-5  # there is a gradient to compare
@@ -207,12 +207,16 @@ def test_gradients_stay_in_their_role(make_learner: MakeLearner, algorithm: str)
     """The critic's gradient does not depend on the online actor, the actor's not on rewards or targets."""
     learner = make_learner(small_config(algorithm))
     columns = random_columns(learner.config)
-    before, _ = learner.gradients(columns)
-    changed, _ = learner.gradients(columns | {"rewards": columns["rewards"] + 1.0})
+
+    def flat(columns: Columns) -> dict[str, torch.Tensor]:
+        return {role: torch.cat(pieces) for role, pieces in learner.gradients(columns)[0].items()}
+
+    before = flat(columns)
+    changed = flat(columns | {"rewards": columns["rewards"] + 1.0})
     assert torch.equal(changed["actor"], before["actor"])
     assert not torch.equal(changed["critic"], before["critic"])
     learner.acting.flat.data.add_(0.1)
-    assert torch.equal(learner.gradients(columns)[0]["critic"], before["critic"])
+    assert torch.equal(flat(columns)["critic"], before["critic"])
 
 
 @pytest.mark.parametrize("algorithm", [*FAMILY, "iql"])
@@ -286,8 +290,8 @@ def test_learners_of_one_process_do_not_share_compiled_code(make_learner: MakeLe
         columns = random_columns(learner.config)
         compiled, _ = learner.gradients(columns)
         eager, _ = learner._gradients(learner.nets(), learner.nets(target=True), {}, columns)
-        for role, gradient in compiled.items():
-            torch.testing.assert_close(gradient, eager[role], rtol=1e-4, atol=1e-5)
+        for role, pieces in compiled.items():
+            torch.testing.assert_close(pieces, eager[role], rtol=1e-4, atol=1e-5)
 
 
 def test_targets_start_equal_to_the_online_networks(ray_session: None) -> None:
@@ -393,8 +397,8 @@ def test_gradients_are_clipped_by_network(make_learner: MakeLearner, by: str) ->
     for role, stack in clipped._roles.items():
         stack.flat.data.copy_(free._roles[role].flat.data)
         clipped._targets[role].flat.data.copy_(free._targets[role].flat.data)
-    got = clipped.critics.unflatten(clipped.gradients(columns)[0]["critic"])
-    want = free.critics.unflatten(free.gradients(columns)[0]["critic"])
+    got = clipped.critics.unflatten(torch.cat(clipped.gradients(columns)[0]["critic"]))
+    want = free.critics.unflatten(torch.cat(free.gradients(columns)[0]["critic"]))
     for agent, norm in enumerate(norms):
         for name, gradient in want.items():
             g = gradient[agent]

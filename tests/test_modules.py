@@ -223,7 +223,8 @@ def test_every_kind_of_module_leaves_its_checkpoint(ray_session: None, tmp_path,
         obs = np.random.default_rng(0).normal(size=(3, 18)).astype(np.float32)
         state = {k: v.expand(3, *v.shape) for k, v in module.get_initial_state().items()}
         got, want = (m.forward_inference({"obs": obs, "state_in": state})["actions"] for m in (module, trained))
-        assert torch.equal(got, want)
+        # Alone its weights lie in another order in memory, which moves the last digit.
+        torch.testing.assert_close(got, want, rtol=0.0, atol=1e-6)
     parameters = sum(p.numel() for p in algo._learner.module[names[0]].parameters())
     stacked = sum(
         s.flat.numel() for r, s in (*algo._learner._roles.items(), *algo._learner._targets.items()) if r != "mixer"

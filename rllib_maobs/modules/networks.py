@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
@@ -111,13 +110,9 @@ class LSTMActor(nn.Module):
         Returns:
             The last h and c, `(..., H)` each.
         """
-        weight = torch.cat([self.from_observation.weight, self.from_hidden.weight], -1)
         for observation, counts in zip(window.unbind(-2), mask.unbind(-1), strict=True):
-            if hidden is None:
-                here = self.from_observation(observation)
-            else:
-                here = F.linear(torch.cat([observation, hidden[0]], -1), weight, self.from_observation.bias)
-            i, f, g, o = here.chunk(4, dim=-1)
+            here = self.from_observation(observation)
+            i, f, g, o = (here if hidden is None else here + self.from_hidden(hidden[0])).chunk(4, dim=-1)
             c = torch.sigmoid(i) * _tanh(g)
             if hidden is not None:
                 c = c + torch.sigmoid(f) * hidden[1]

@@ -80,15 +80,21 @@ class Stack:
         self.flat = other.flat
         self._bind()
 
+    def pieces(self, flat: Tensor) -> list[Tensor]:
+        """Views of a flat vector `(P,)`, one for each parameter in order, each a vector, too."""
+        return list(flat.split([torch.Size(shape).numel() for shape in self._shapes.values()]))
+
     def unflatten(self, flat: Tensor) -> Params:
         """Views of a flat vector `(P,)` as stacked parameters by name."""
-        sizes = [torch.Size(shape).numel() for shape in self._shapes.values()]
-        parts = flat.split(sizes)
-        return {name: part.view(shape) for (name, shape), part in zip(self._shapes.items(), parts, strict=True)}
+        # Weights lie input by output: the order in which batched products take them, and leave their gradients.
+        return {
+            name: piece.view(shape) if len(shape) < 3 else piece.view(shape[0], shape[2], shape[1]).mT
+            for (name, shape), piece in zip(self._shapes.items(), self.pieces(flat), strict=True)
+        }
 
-    def flatten(self, params: Params) -> Tensor:
-        """One flat vector `(P,)` from stacked parameters (or gradients) by name; a copy."""
-        return torch.cat([params[name].reshape(-1) for name in self._shapes])
+    def flatten(self, params: Params) -> list[Tensor]:
+        """The pieces of stacked parameters (or gradients) by name, a vector each; copied only if they lie otherwise."""
+        return [(p if p.dim() < 3 else p.mT).reshape(-1) for p in (params[name] for name in self._shapes)]
 
     def spread(self, rows: Tensor, dim: int = 0) -> Tensor:
         """What is there for each row, along a dimension, for each agent instead: the same if nothing is shared."""
