@@ -38,7 +38,9 @@ class Batch(NamedTuple):
     """A minibatch as the losses see it."""
 
     obs: Tensor  # (B, N, O)
-    history: tuple[Tensor, ...]  # what actors see: (obs,), or windows (B, N, T, O) and their mask (B, T)
+    # What actors see: (obs,), or windows (B, N, T, O), their mask (B, T) and, if carried, the h and c (B, N, 2, H)
+    # with which acting began them: constants, whatever weights made them (Kapturowski et al. 2019's stored state).
+    history: tuple[Tensor, ...]
     state: Tensor  # (B, S)
     actions: Tensor  # (B, N, A) in [-1, 1], or one-hot
     rewards: Tensor  # (B, N), of n steps
@@ -180,7 +182,7 @@ class JointLearner(TorchLearner):
 
     def act(self, actor: Params, history: tuple[Tensor, ...]) -> Tensor:
         """Every agent's network on what it sees, before tanh: `(B, N, A)`."""
-        dims = (1, None)[: len(history)]
+        dims = (1, None, 1)[: len(history)]
         return self._roles["actor"](actor, *zip(history, dims, strict=True), method="raw")
 
     def actions(self, output: Tensor, noise: Tensor | None) -> Tensor:
@@ -327,6 +329,8 @@ class JointLearner(TorchLearner):
             if f"{prefix}window" in columns:
                 # (B, T, N, O) in replay, where a window is T rows
                 seen[prefix] = columns[f"{prefix}window"].transpose(1, 2), columns[f"{prefix}mask"]
+                if f"{prefix}hidden" in columns:
+                    seen[prefix] += (columns[f"{prefix}hidden"],)
             else:
                 seen[prefix] = (columns[f"{prefix}obs"],)
             if self.normalizers is not None:

@@ -6,7 +6,7 @@ import math
 import pickle
 import time
 import uuid
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +69,8 @@ class JointSample:
     final_obs: NDArray[np.float32]
     state: NDArray[np.float32] | None
     final_state: NDArray[np.float32] | None
+    hidden: NDArray[np.float32] | None
+    final_hidden: NDArray[np.float32] | None
     source: str
     start: int
 
@@ -166,19 +168,24 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         spec = self.config.get_multi_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
         self.module = spec.build()
         modules: list[AgentModule] = [self.module[mid] for mid in self.module_ids]
-        self.actors = Stack([module.acting for module in modules])
+        carries = modules[0].carries
+        self.actors = Stack([module.acting for module in modules], ("carry", "head") if carries else ("forward",))
         self.normalizers = (
             Stack([module.normalizer for module in modules]) if self.config.normalize_observations else None
         )
         self._agent = modules[0]
         # (N, A): where shorter actions are padded; None if none are.
         self._padding = None if self.team.action_mask.all() else torch.from_numpy(~self.team.action_mask)
-        self._window: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._window: tuple[torch.Tensor, ...] | None = None
         if self._agent.seq_length:
-            # The modules' own state, of all agents: the last T observations (E, T, N, O) and which of them count.
+            # The modules' own state, of all agents: the last T observations (E, T, N, O), which of them count, and
+            # if they are carried the h and c with which the last window ended (E, N, 2, H).
             shape = (self.num_envs, self._agent.seq_length)
             window = torch.zeros(*shape, len(self.team.agents), self.team.observation_size)
             self._window = window, torch.zeros(shape)
+            if carries:
+                hidden = torch.zeros(self.num_envs, len(self.team.agents), 2, self.config.hidden_size)
+                self._window = *self._window, hidden
 
     def share(self, actors: Stack, normalizers: Stack | None) -> None:
         """Acts with the tensors of a learner in this process from now on, so weights need no syncing."""
@@ -235,12 +242,11 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         columns, finals = [list(part) for part in zip(*steps, strict=True)]
         stacked = [None if c[0] is None else np.stack(c) for c in zip(*columns, strict=True)]
         final = [None if c[0] is None else np.concatenate(c) for c in zip(*finals, strict=True)]
-        obs, state, actions, rewards, terminated, truncated = stacked
+        obs, state, actions, rewards, terminated, truncated, hidden = stacked
         assert obs is not None and actions is not None and rewards is not None and final[0] is not None
         assert terminated is not None and truncated is not None
-        return [
-            JointSample(obs, actions, rewards, terminated, truncated, final[0], state, final[1], self._source, start)
-        ]
+        always = obs, actions, rewards, terminated, truncated, final[0]
+        return [JointSample(*always, state, final[1], hidden, final[2], self._source, start)]
 
     def _reset_all(self) -> None:
         assert self.env is not None
@@ -268,7 +274,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     def _step(self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None) -> tuple[Any, Any]:
         """One step of all copies: its row of every column, and the final observations and states."""
         assert self.env is not None and self._obs is not None
-        obs, state = self._obs, self._state()
+        obs, state, hidden = self._obs, self._state(), self._hidden()
         actions = self._act(obs, explore, random_actions)
         played = actions.argmax(-1) if self.team.discrete else self._low + (actions + 1.0) * self._range
         self._obs, rewards, terminated, truncated, info = self.env.step(played)
@@ -281,6 +287,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
         done = terminated | truncated
         final_obs, final_state = self._obs[done], None
+        carried = self._hidden()
+        final_hidden = None if carried is None else carried[done]
         if done.any():
             end = self._state()
             final_state = None if end is None else end[done]
@@ -291,14 +299,18 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             self._check_finite("observation", self._obs)
         elif state is not None:
             final_state = state[:0]
-        return (obs, state, actions, rewards, terminated, truncated), (final_obs, final_state)
+        return (obs, state, actions, rewards, terminated, truncated, hidden), (final_obs, final_state, final_hidden)
 
     def _state(self) -> NDArray[np.float32] | None:
         assert self.env is not None
         return self.env.state("world") if self.team.state_size else None
 
+    def _hidden(self) -> NDArray[np.float32] | None:
+        """The h and c from which the next windows start, `(E, N, 2, H)`, if they are carried."""
+        return self._window[2].numpy() if self._window is not None and len(self._window) == 3 else None
+
     def _forget(self, done: NDArray[np.bool_]) -> None:
-        """Empties the windows of the copies whose episodes are over."""
+        """Empties the windows, and zeroes h and c, of the copies whose episodes are over."""
         if self._window is not None:
             for part in self._window:
                 part[torch.from_numpy(done)] = 0.0
@@ -308,21 +320,35 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         seen: list[torch.Tensor] = [torch.from_numpy(obs)]
         dims: list[int | None] = [1]
         if self._window is not None:
-            self._window = push(*self._window, seen[0])
-            seen, dims = list(self._window), [2, None]
-        if random_actions:
-            uniform = torch.rand((*obs.shape[:2], self.team.action_size), generator=self._generator)
-            return self._encoded(self._padded(uniform).argmax(-1) if self.team.discrete else uniform * 2.0 - 1.0)
+            window, mask, *carried = self._window
+            self._window = *push(window, mask, seen[0]), *carried
+            seen, dims = list(self._window), [2, None, 1][: len(self._window)]
+        carries = len(seen) == 3
+        if random_actions and not carries:
+            return self._random(obs.shape[:2])
         with self.metrics.log_time(RLMODULE_INFERENCE_TIMER), torch.no_grad():
             seen = [part.to(self.actors.flat.device) for part in seen]
             if self.normalizers is not None:
                 seen[0], dims[0] = self.normalizers(self.normalizers.params, (seen[0], dims[0])), 1
-            outputs = self._padded(self.actors(self.actors.params, *zip(seen, dims, strict=True)).cpu())
+            method = "forward"
+            if carries:  # h and c go on with the window, whatever chooses the actions
+                hidden = self.actors(self.actors.params, *zip(seen, dims, strict=True), method="carry")
+                assert self._window is not None
+                self._window = *self._window[:2], hidden.cpu()
+                seen, dims, method = [hidden], [1], "head"
+            if random_actions:
+                return self._random(obs.shape[:2])
+            outputs = self._padded(self.actors(self.actors.params, *zip(seen, dims, strict=True), method=method).cpu())
             if explore:
                 actions = self._agent.explore(outputs, self.num_env_steps_sampled_lifetime, self._generator)
             else:
                 actions = self._agent.greedy(outputs)
         return self._encoded(actions)
+
+    def _random(self, shape: Sequence[int]) -> NDArray[np.float32]:
+        """Uniformly random actions of `(E, N)` agents."""
+        uniform = torch.rand((*shape, self.team.action_size), generator=self._generator)
+        return self._encoded(self._padded(uniform).argmax(-1) if self.team.discrete else uniform * 2.0 - 1.0)
 
     def _padded(self, outputs: torch.Tensor) -> torch.Tensor:
         """The networks' outputs `(E, N, A)` with the value of no discrete action in the padding."""

@@ -71,6 +71,8 @@ def random_columns(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> 
             columns[f"{prefix}mask"] = (torch.arange(length) >= length - count).to(torch.get_default_dtype())
         else:
             columns[f"{prefix}obs"] = normal(size, n, o) * present
+        if config.carry_hidden:
+            columns[f"{prefix}hidden"] = normal(size, n, 2, config.hidden_size)
         if config.critic_state == "world" and config.uses_state:
             columns[f"{prefix}state"] = normal(size, config.state_size)
     return columns

@@ -31,13 +31,13 @@ def mlp(layers: Layers, x: Tensor) -> Tensor:
     return x
 
 
-def lstm(layers: Layers, observations: Tensor) -> Tensor:
-    """An LSTM cell from zero over observations `(t, O)`, then the other layers."""
+def lstm(layers: Layers, observations: Tensor, start: Tensor | None) -> Tensor:
+    """An LSTM cell from h and c `(2, H)`, or from zero, over observations `(t, O)`, then the other layers."""
     weight, bias, recurrent, *rest = layers
     size = recurrent.shape[1]
     cell = nn.LSTMCell(observations.shape[1], size)
     own = {"weight_ih": weight, "bias_ih": bias, "weight_hh": recurrent, "bias_hh": torch.zeros(4 * size)}
-    h = c = torch.zeros(size)
+    h, c = torch.zeros(2, size) if start is None else start
     for x in observations:
         h, c = functional_call(cell, own, (x, (h, c)))
     return mlp(rest, h)
@@ -79,7 +79,10 @@ class Equations:
 
     def output(self, kind: str, sample: dict[str, Tensor], row: int, agent: int, prefix: str = "") -> Tensor:
         observations, layers = self.seen(sample, row, agent, prefix), self.nets[kind][agent]
-        return lstm(layers, observations) if self.config.actor == "lstm" else mlp(layers, observations[-1])
+        if self.config.actor == "mlp":
+            return mlp(layers, observations[-1])
+        start = sample[f"{prefix}hidden"][row, agent] if self.config.carry_hidden else None
+        return lstm(layers, observations, start)
 
     def state(self, sample: dict[str, Tensor], row: int, prefix: str) -> Tensor:
         if self.config.critic_state == "world":

@@ -80,9 +80,14 @@ def test_random_steps_come_first(ray_session: None) -> None:
     algo.stop()
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_restored_run_goes_on_exactly_as_the_first(ray_session: None, algorithm: str, tmp_path: Path) -> None:
-    config = small_config(algorithm, horizon=15)
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [*((name, {}) for name in ALGORITHMS)] + [(a, {"actor": "lstm", "carry_hidden": True}) for a in ("maddpg", "qmix")],
+)
+def test_a_restored_run_goes_on_exactly_as_the_first(
+    ray_session: None, algorithm: str, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    config = small_config(algorithm, horizon=15).training(**settings)
     config.evaluation(evaluation_interval=1, evaluation_duration=2)
     algo = config.build_algo()
     algo.train()
@@ -221,6 +226,7 @@ class PictureAgents(TwoAgents):
         (lambda c: c.training(actor="gru"), r"actor must be one of 'mlp', 'lstm', not 'gru'"),
         (lambda c: c.training(seq_length=0), r"seq_length must be a finite number in \[1, inf\), not 0"),
         (lambda c: c.training(seq_length=2.5), r"seq_length must be an integer, not 2.5"),
+        (lambda c: c.training(carry_hidden=True), r"carry_hidden=True .* legal with actor='lstm', not with .*'mlp'"),
         (lambda c: c.training(n_step=0), r"n_step must be a finite number in \[1, inf\)"),
         (lambda c: c.training(policy_delay=0), r"policy_delay must be a finite number in \[1, inf\)"),
         (lambda c: c.training(gumbel_temperature=0.0), r"gumbel_temperature must be a finite number in \(0, inf\)"),

@@ -86,12 +86,14 @@ def learned_prey(config: maobs.JointConfig) -> maobs.JointConfig:
 
 
 TD3 = {"twin_critics": True, "target_noise": 0.2, "target_noise_clip": 0.3}
+CARRIED = "h and c carried"
 # Algorithm, settings, further changes; the name of the case.
 CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
     **{f"{a}, {s}": (a, {"critic_state": s}, []) for a in FAMILY for s in ("observations", "world")},
     **{f"maddpg, others' actions {o}": ("maddpg", {"other_agents_actions": o}, []) for o in ("current", "joint")},
     "maddpg-lstm": ("maddpg-lstm", {}, []),
     **{f"{a} with LSTM": (a, {"actor": "lstm"}, []) for a in ("iddpg", "maddpg-l", "facmac", "iql", "vdn", "qmix")},
+    **{f"{a}, {CARRIED}": (a, {"actor": "lstm", "carry_hidden": True}, []) for a in ("maddpg-lstm", "facmac", "qmix")},
     **{f"facmac, {c}": ("facmac", {"critic_source": c}, []) for c in ("shared", "others", "own")},
     "facmac, world": ("facmac", {"critic_state": "world"}, []),
     **{f"{a}, double {d}": (a, {"double_q": d}, []) for a in ("iql", "vdn", "qmix") for d in (False, True)},
@@ -109,6 +111,8 @@ CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
     **{f"{a}, two policies": (a, {"agent_id_input": True}, [two_policies]) for a in (*FAMILY, "qmix")},
     "facmac own, two policies": ("facmac", {"critic_source": "own"}, [two_policies]),
     **{f"{a}, learned prey": (a, {}, [learned_prey]) for a in (*FAMILY, "maddpg-lstm")},
+    f"maddpg-lstm, learned prey, {CARRIED}": ("maddpg-lstm", {"carry_hidden": True}, [learned_prey]),
+    f"maddpg-lstm, one policy, {CARRIED}": ("maddpg-lstm", {"carry_hidden": True}, [one_policy]),
     "maddpg-l, learned prey with ids": ("maddpg-l", {"agent_id_input": True}, [learned_prey]),
 }
 
@@ -247,6 +251,7 @@ def test_truncation_bootstraps_and_termination_does_not(make_learner: MakeLearne
 
 
 COMPILED = [*ALGORITHMS, "facmac own", "td3", "shared", "clipped", "normalised", "discrete", "prey"]
+COMPILED += ["carried", "qmix carried"]
 
 
 @pytest.mark.parametrize("case", COMPILED)
@@ -263,6 +268,8 @@ def test_compiled_equals_eager_over_many_updates(make_learner: MakeLearner, case
             "normalised": lambda: small_config("maddpg-lstm").training(normalize_observations=True),
             "discrete": lambda: discrete(small_config("maddpg")),
             "prey": lambda: learned_prey(small_config("maddpg")),
+            "carried": lambda: small_config("maddpg-lstm").training(carry_hidden=True),
+            "qmix carried": lambda: small_config("qmix").training(actor="lstm", carry_hidden=True),
         }[case]()
 
     eager = make_learner(config())

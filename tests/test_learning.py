@@ -149,9 +149,15 @@ class CueGame(Game):
         return -((left[0] - self.cue) ** 2 + (right[0] - self.cue) ** 2) if self.t == self.steps - 1 else 0.0
 
 
-@pytest.mark.parametrize("algorithm", ["maddpg-lstm", "maddpg"])
-def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str) -> None:
-    """Without memory the last actions agree with the cue half of the time, with a window over the episode always."""
+@pytest.mark.parametrize(
+    ("algorithm", "memory"),
+    [("maddpg-lstm", {}), ("maddpg", {}), ("maddpg-lstm", {"seq_length": 1, "carry_hidden": True})],
+)
+def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str, memory: dict[str, Any]) -> None:
+    """Without memory the last actions agree with the cue half of the time.
+
+    With a window over the episode they always do, and if h and c are carried, with a window of one observation.
+    """
     config = maobs.ALGORITHMS[algorithm]().environment(CueGame)
     config.env_runners(num_envs_per_env_runner=20)
     config.training(
@@ -165,6 +171,7 @@ def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str) -> 
         tau=0.05,
         replay_buffer_capacity=20_000,
     )
+    config.training(**memory)
     config.rl_module(model_config={"hidden_sizes": (32, 32)})
     config.reporting(min_sample_timesteps_per_iteration=9_000)
     algo = config.debugging(seed=0).build_algo()

@@ -66,19 +66,22 @@ def test_what_lies_in_the_padding_changes_nothing(actor: LSTMActor) -> None:
 def test_a_carried_state_goes_on(actor: LSTMActor) -> None:
     """Two windows, the second from the first one's h and c, are one long window."""
     window, mask = torch.randn(5, 6, O), torch.ones(5, 6)
-    hidden = actor.unroll(window[:, :4], mask[:, :4])
+    hidden = actor.carry(window[:, :4], mask[:, :4])
     torch.testing.assert_close(actor(window[:, 4:], mask[:, 4:], hidden), actor(window, mask))
+    torch.testing.assert_close(actor.head(actor.carry(window[:, 4:], mask[:, 4:], hidden)), actor(window, mask))
 
 
+@pytest.mark.parametrize("carried", [False, True])
 @pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
-def test_the_action_taken_is_the_learners_recomputation(ray_session: None, algorithm: str) -> None:
+def test_the_action_taken_is_the_learners_recomputation(ray_session: None, algorithm: str, carried: bool) -> None:
     """From the runner through replay to the learner: the same windows, the same actions, to 1e-6."""
-    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4)
+    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, carry_hidden=carried)
     learner = build_learner(config)
     runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
     runner.share(learner.acting, None)
     team = config.team
-    buffer = JointReplayBuffer(400, len(team.agents), team.observation_size, team.action_size, seed=0)
+    sizes = len(team.agents), team.observation_size, team.action_size, 0, config.hidden_size
+    buffer = JointReplayBuffer(400, *sizes, seed=0)
     for length in (3, 20, 31):
         (sample,) = runner.sample(num_timesteps=2 * length, explore=False)
         buffer.add(**vars(sample))
@@ -86,11 +89,37 @@ def test_the_action_taken_is_the_learners_recomputation(ray_session: None, algor
     assert set(columns["mask"].sum(1).tolist()) == {1.0, 2.0, 3.0, 4.0}
     batch = learner.prepare(columns, {})
     with torch.no_grad():
-        outputs = learner.acting(learner.acting.params, (batch.history[0], 1), (batch.history[1], None))
+        outputs = learner.acting(learner.acting.params, *zip(batch.history, (1, None, 1), strict=False))
+    assert len(batch.history) == 2 + carried
     if team.discrete:
         assert torch.equal(outputs.argmax(-1), batch.actions.argmax(-1))
     else:
         torch.testing.assert_close(outputs, batch.actions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
+def test_h_and_c_go_from_window_to_window(ray_session: None, algorithm: str) -> None:
+    """Zero at an episode's start, then what the last window ended with, whatever chooses actions; zero would differ."""
+    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, carry_hidden=True)
+    learner = build_learner(config.training(normalize_observations=True))
+    runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    learner.observe(np.random.default_rng(0).normal(1.0, 2.0, (50, 3, 18)).astype(np.float32))
+    runner.share(learner.acting, learner.normalizers)
+    for how in ({"explore": False}, {"explore": True}, {"random_actions": True}):
+        (sample,) = runner.sample(num_timesteps=2 * 31, force_reset=True, **how)
+        team = config.team
+        buffer = JointReplayBuffer(400, 3, team.observation_size, team.action_size, 0, config.hidden_size, seed=0)
+        buffer.add(**vars(sample))
+        columns = buffer.sample((300,), gamma=0.9, seq_length=4)
+        starts = columns["mask"].sum(1) == 1
+        assert torch.equal(columns["hidden"].flatten(1).any(1), ~starts) and starts.any()
+        history = learner.prepare(columns, learner.normalizers.params).history
+        seen = list(zip(history, (1, None, 1), strict=True))
+        with torch.no_grad():
+            ended = runner.actors(runner.actors.params, *seen, method="carry")
+            from_zero = runner.actors(runner.actors.params, *seen[:2], method="carry")
+        torch.testing.assert_close(columns["next_hidden"], ended, rtol=0, atol=1e-6)
+        assert ((ended - from_zero).abs().flatten(1).amax(1) > 1e-3).equal(~starts)
 
 
 def test_windows_do_not_cross_a_reset_in_acting(ray_session: None) -> None:
@@ -123,6 +152,28 @@ def test_the_lstm_module_works_in_rllibs_own_runner(ray_session: None) -> None:
             np.testing.assert_allclose(agent.get_actions(t), out["actions"][0].numpy(), atol=1e-5)
             state = out["state_out"]
     assert runner.sample(num_timesteps=4, explore=True)
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
+def test_carried_h_and_c_are_the_same_in_both_runners(ray_session: None, algorithm: str) -> None:
+    """Ours, shown the observations of RLlib's, ends every window with the same h and c and acts the same."""
+    config = small_config(algorithm, horizon=7).training(actor="lstm", carry_hidden=True)
+    config.env_runners(num_envs_per_env_runner=1).validate()
+    joint = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    config.env_runner_cls = MultiAgentEnvRunner
+    stock = MultiAgentEnvRunner(config=config, worker_index=0)
+    joint.module.set_state(stock.module.get_state())
+    for episode in stock.sample(num_episodes=2, explore=False):
+        agents = [episode.agent_episodes[agent] for agent in joint.team.agents]
+        joint._forget(np.ones(1, dtype=np.bool_))
+        for t in range(7):
+            acted = joint._act(np.stack([agent.get_observations(t) for agent in agents])[None], False, False)[0]
+            want = np.stack([agent.get_actions(t) for agent in agents])
+            np.testing.assert_allclose(acted.argmax(-1) if joint.team.discrete else acted, want, atol=1e-6)
+            states = [agent.get_extra_model_outputs("state_out", t) for agent in agents]
+            want = np.stack([[state["hidden"], state["cell"]] for state in states])
+            np.testing.assert_allclose(joint._hidden()[0], want, atol=1e-6)
+    assert stock.sample(num_timesteps=4, explore=True)
 
 
 def test_an_lstm_module_asks_for_its_state(ray_session: None) -> None:
@@ -205,10 +256,15 @@ def test_vdn_is_the_plain_sum(ray_session: None) -> None:
     torch.testing.assert_close(learner.total({}, q, torch.zeros(7, 1)), q[:, :1] + q[:, 1:2] + q[:, 2:])
 
 
-@pytest.mark.parametrize(("algorithm", "shared"), [("maddpg-lstm", False), ("facmac", True), ("qmix", True)])
-def test_every_kind_of_module_leaves_its_checkpoint(ray_session: None, tmp_path, algorithm: str, shared: bool) -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "shared", "carried"),
+    [("maddpg-lstm", False, False), ("facmac", True, False), ("qmix", True, False), ("maddpg-lstm", False, True)],
+)
+def test_every_kind_of_module_leaves_its_checkpoint(
+    ray_session: None, tmp_path, algorithm: str, shared: bool, carried: bool
+) -> None:
     """Each acts alone; shared parameters are there once; the mixer is a module of its own."""
-    config = small_config(algorithm)
+    config = small_config(algorithm).training(carry_hidden=carried)
     if shared:
         config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *a, **k: "all")
     algo = config.build_algo()
@@ -221,10 +277,11 @@ def test_every_kind_of_module_leaves_its_checkpoint(ray_session: None, tmp_path,
     for name in names:
         module, trained = RLModule.from_checkpoint(f"{folder}/{name}"), algo.get_module(name)
         obs = np.random.default_rng(0).normal(size=(3, 18)).astype(np.float32)
-        state = {k: v.expand(3, *v.shape) for k, v in module.get_initial_state().items()}
-        got, want = (m.forward_inference({"obs": obs, "state_in": state})["actions"] for m in (module, trained))
+        state = {k: torch.ones(3, *v.shape) for k, v in module.get_initial_state().items()}
+        got, want = (m.forward_inference({"obs": obs, "state_in": state}) for m in (module, trained))
         # Alone its weights lie in another order in memory, which moves the last digit.
-        torch.testing.assert_close(got, want, rtol=0.0, atol=1e-6)
+        torch.testing.assert_close(got["actions"], want["actions"], rtol=0.0, atol=1e-6)
+        assert ("cell" in got.get("state_out", {})) == carried
     parameters = sum(p.numel() for p in algo._learner.module[names[0]].parameters())
     stacked = sum(
         s.flat.numel() for r, s in (*algo._learner._roles.items(), *algo._learner._targets.items()) if r != "mixer"
@@ -269,8 +326,8 @@ def test_random_numbers_of_the_losses_survive_a_checkpoint(ray_session: None, tm
 
 def test_columns_of_the_tests_are_those_of_replay(ray_session: None) -> None:
     """The random columns that the learner's tests use have the names and shapes that replay gives."""
-    for algorithm in ("maddpg", "maddpg-lstm", "qmix"):
-        config = small_config(algorithm).training(critic_state="world")
+    for algorithm, carried in (("maddpg", False), ("maddpg-lstm", False), ("qmix", False), ("maddpg-lstm", True)):
+        config = small_config(algorithm).training(critic_state="world", carry_hidden=carried)
         algo = config.build_algo()
         algo.train()
         seq_length = 3 if config.actor == "lstm" else 0

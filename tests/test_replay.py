@@ -8,7 +8,7 @@ import torch
 
 from rllib_maobs.replay import JointReplayBuffer
 
-N, O, A, S = 3, 4, 2, 5  # noqa: E741
+N, O, A, S, H = 3, 4, 2, 5, 6  # noqa: E741
 G = 0.9
 
 
@@ -25,14 +25,19 @@ class Simulator:
         code = np.arange(self.copies) * 10_000 + self.episode * 100 + self.t
         return (code[:, None, None] + np.arange(N)[:, None] / 10 + np.zeros(O)).astype(np.float32)
 
-    def fragment(self, steps: int, state: bool = False) -> dict[str, Any]:
+    def hidden(self) -> np.ndarray:
+        """As the observations, with h apart from c."""
+        return self.obs()[:, :, :1, None] + np.array([[0.01], [0.02]], dtype=np.float32) + np.zeros(H, dtype=np.float32)
+
+    def fragment(self, steps: int, state: bool = False, hidden: bool = False) -> dict[str, Any]:
         rows: dict[str, list[np.ndarray]] = {k: [] for k in ("obs", "actions", "rewards", "terminated", "truncated")}
-        finals, states, final_states = [], [], []
+        finals, states, final_states, hiddens, final_hiddens = [], [], [], [], []
         start = self.start
         for _ in range(steps):
             obs = self.obs()
             rows["obs"].append(obs)
             states.append(np.repeat(obs[:, 0, :1], S, axis=1))
+            hiddens.append(self.hidden())
             rows["actions"].append(obs[:, :, :1] + np.arange(A, dtype=np.float32) / 100)
             rows["rewards"].append(-obs[:, :, 0])
             self.t += 1
@@ -42,6 +47,7 @@ class Simulator:
             rows["truncated"].append(over & (self.episode % 2 == 1))
             finals.append(self.obs()[over])
             final_states.append(np.repeat(self.obs()[over][:, 0, :1], S, axis=1))
+            final_hiddens.append(self.hidden()[over])
             self.episode[over] += 1
             self.t[over] = 0
             self.start += 1
@@ -49,6 +55,8 @@ class Simulator:
         columns |= {"final_obs": np.concatenate(finals), "source": self.source, "start": start}
         if state:
             columns |= {"state": np.stack(states), "final_state": np.concatenate(final_states)}
+        if hidden:
+            columns |= {"hidden": np.stack(hiddens), "final_hidden": np.concatenate(final_hiddens)}
         return columns
 
 
@@ -225,6 +233,26 @@ def test_stored_states_go_with_their_observations() -> None:
     assert torch.equal(batch["next_state"][..., 0], batch["next_obs"][..., 0, 0])
 
 
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_stored_h_and_c_go_with_the_windows_newest_observations(n_step: int) -> None:
+    """Each agent's own, those after the last step with the final observation, also when old rows give way."""
+    buffer = JointReplayBuffer(40, N, O, A, hidden_size=H, seed=0)
+    simulator = Simulator(2)
+    for _ in range(20):
+        buffer.add(**simulator.fragment(3, hidden=True))
+        if len(buffer) < 10:
+            continue
+        batch = buffer.sample((8, 16), gamma=G, n_step=n_step, seq_length=2)
+        for name in ("", "next_"):
+            now = batch[f"{name}window"][:, :, -1, :, :1, None]
+            want = (now + torch.tensor([[0.01], [0.02]])).expand(8, 16, N, 2, H)
+            torch.testing.assert_close(batch[f"{name}hidden"], want, rtol=0, atol=2e-3)
+    with pytest.raises(ValueError, match="stores 'hidden', but none was given"):
+        buffer.add(**simulator.fragment(3))
+    extra = JointReplayBuffer(500, N, O, A, hidden_size=H).nbytes - JointReplayBuffer(500, N, O, A).nbytes
+    assert extra == 500 * N * 2 * H * 4
+
+
 def test_sampling_is_uniform() -> None:
     buffer = JointReplayBuffer(50, N, O, A, seed=0)
     buffer.add(**Simulator(1, length=40).fragment(41))
@@ -235,18 +263,20 @@ def test_sampling_is_uniform() -> None:
 
 def test_a_restored_buffer_goes_on_as_the_first() -> None:
     simulator = Simulator(2)
-    buffer = JointReplayBuffer(64, N, O, A, seed=0)
+    buffer = JointReplayBuffer(64, N, O, A, hidden_size=H, seed=0)
     for _ in range(20):
-        buffer.add(**simulator.fragment(3))
-    restored = JointReplayBuffer(64, N, O, A, seed=99)
+        buffer.add(**simulator.fragment(3, hidden=True))
+    restored = JointReplayBuffer(64, N, O, A, hidden_size=H, seed=99)
     restored.set_state(buffer.get_state())
-    more = simulator.fragment(3)
+    more = simulator.fragment(3, hidden=True)
     for b in (buffer, restored):
         b.add(**more)
     first, second = buffer.sample((100,), gamma=G), restored.sample((100,), gamma=G)
     assert all(torch.equal(first[k], second[k]) for k in first)
     with pytest.raises(ValueError, match="'capacity': 64"):
         JointReplayBuffer(65, N, O, A).set_state(buffer.get_state())
+    with pytest.raises(ValueError, match=r"'hidden_size': 6.*'hidden_size': 0"):
+        JointReplayBuffer(64, N, O, A).set_state(buffer.get_state())
 
 
 def test_too_small_a_buffer_says_so() -> None:

@@ -62,6 +62,7 @@ class JointAlgorithm(Algorithm):
             team.observation_size,
             team.action_size,
             team.state_size,
+            self.config.hidden_size,
             seed=self.config.seed,
             device=self._learner.device,
         )

@@ -25,6 +25,7 @@ _MODEL_SETTINGS = (
     "activation",
     "actor",
     "seq_length",
+    "carry_hidden",
     "exploration",
     "normalize_observations",
     "critic_state_size",
@@ -111,6 +112,7 @@ class JointConfig(AlgorithmConfig):
         self.critic_state: Literal["observations", "world"] = "observations"
         # Off by default.
         self.actor: Literal["mlp", "lstm"] = "mlp"
+        self.carry_hidden = False
         self.n_step = 1
         self.twin_critics = False
         self.policy_delay = 1
@@ -147,6 +149,7 @@ class JointConfig(AlgorithmConfig):
         exploration: dict[str, float] = NotProvided,
         actor: Literal["mlp", "lstm"] = NotProvided,
         seq_length: int = NotProvided,
+        carry_hidden: bool = NotProvided,
         n_step: int = NotProvided,
         twin_critics: bool = NotProvided,
         policy_delay: int = NotProvided,
@@ -182,6 +185,10 @@ class JointConfig(AlgorithmConfig):
                 `final` 0.05 (the paper's; algorithms of the Q-learning family have others).
             actor: "mlp" (default), or "lstm" over the last `seq_length` observations (eq. 10).
             seq_length: T, the window of an LSTM actor. Default 5 (table II).
+            carry_hidden: Whether an LSTM's window starts from the h and c with which the one a step earlier ended, zero
+                at an episode's start (eq. 10), instead of always from zero. Learning starts from those of acting,
+                stored in replay (2 H floats for each agent and row), as constants (Kapturowski et al. 2019). Needs
+                `actor="lstm"`. Default False.
             n_step: Steps of reward in a target before it bootstraps (Sutton 1988). Default 1.
             twin_critics: Whether every agent has two critics, whose minimum is the target's value (TD3, Fujimoto et
                 al. 2018; MATD3, Ackermann et al. 2019). Default False.
@@ -225,6 +232,10 @@ class JointConfig(AlgorithmConfig):
         self._validate_numbers()
         one_of("critic_state", self.critic_state, CRITIC_STATES)
         one_of("actor", self.actor, ACTORS)
+        if self.carry_hidden and self.actor != "lstm":
+            raise ValueError(
+                f"carry_hidden=True needs h and c to carry: legal with actor='lstm', not with actor={self.actor!r}."
+            )
         Exploration.from_dict({**self.default_exploration, **self.exploration})
         settings = self.model_config
         for name in settings:
@@ -346,6 +357,11 @@ class JointConfig(AlgorithmConfig):
         """S, the width of what a centralised critic sees as the state."""
         return self.team.state_size if self.critic_state == "world" else len(self.state_columns)
 
+    @property
+    def hidden_size(self) -> int:
+        """H, the size of the h and c that are carried and stored; 0 if they are not."""
+        return self.model_config["hidden_sizes"][0] if self.carry_hidden else 0
+
     def critic_sizes(self, agent: str) -> tuple[int, int] | None:
         """Widths of what one agent's critic sees, of the state and of the actions; None if there are no critics."""
         raise TypeError(f"{type(self).__name__} defines no critic_sizes: derive a config that does.")
@@ -362,6 +378,7 @@ class JointConfig(AlgorithmConfig):
             "activation": "relu",
             "actor": self.actor,
             "seq_length": self.seq_length,
+            "carry_hidden": self.carry_hidden,
             "exploration": {**self.default_exploration, **self.exploration},
             "normalize_observations": self.normalize_observations,
             "num_critics": 1 + self.twin_critics,

@@ -38,7 +38,7 @@ class QLearner(JointLearner):
 
     def utilities(self, utility: Params, history: tuple[Tensor, ...]) -> Tensor:
         """Every agent's Q_a of each of its actions, `(B, N, A)`."""
-        dims = (1, None)[: len(history)]
+        dims = (1, None, 1)[: len(history)]
         return self._roles["critic"](utility, *zip(history, dims, strict=True))
 
     def legal(self, values: Tensor) -> Tensor:

@@ -20,6 +20,10 @@ class MADDPGLSTMConfig(MADDPGConfig):
     starts every window from zero h and c, when it acts and when it learns alike. Windows never cross a reset,
     and one at an episode's start is as long as the episode so far. Critics and both losses are MADDPG's (eq. 2
     and 3); the target actors' windows end one step later. Any algorithm here takes `actor="lstm"`.
+
+    With `carry_hidden=True` it is eq. 10 to the letter, u_a = mu_a({o_a^(t-i)}, h^(t-1), c^(t-1)): the window at step t
+    starts from the h and c with which the one at t-1 ended, which learning takes from replay as acting had them. They
+    have seen all but the newest of its observations before; with `seq_length=1` each is seen once.
     """
 
     name = "maddpg-lstm"

@@ -47,8 +47,9 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     takes is the unsquashed one: `low + (action + 1) / 2 * (high - low)`. With a Discrete action space they are
     the actions' numbers, `(B,)`.
 
-    An LSTM actor is stateful: its state is the window of the last T observations. Start every episode with
-    `get_initial_state()` (batched), and give each call the state that the one before returned:
+    An LSTM actor is stateful: its state is the window of the last T observations, with `carry_hidden` also the h and c
+    with which the last window ended and the next one starts. Start every episode with `get_initial_state()` (batched),
+    and give each call the state that the one before returned:
 
     ```python
     state = {name: value[None] for name, value in module.get_initial_state().items()}
@@ -57,9 +58,9 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     ```
 
     Settings (`model_config`): `hidden_sizes`, `activation`, `actor` ("mlp" or "lstm"), `seq_length` (T),
-    `exploration` (see `Exploration`), `normalize_observations`, and `critic_state_size`, `critic_action_size`,
-    `num_critics`: the widths of what the algorithm's critic sees and how many there are of it. Without the
-    critic's sizes the module has no critic: enough for acting.
+    `carry_hidden`, `exploration` (see `Exploration`), `normalize_observations`, and `critic_state_size`,
+    `critic_action_size`, `num_critics`: the widths of what the algorithm's critic sees and how many there are of
+    it. Without the critic's sizes the module has no critic: enough for acting.
     """
 
     actor: MLPActor | LSTMActor
@@ -90,6 +91,7 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         self.discrete = isinstance(self.action_space, gym.spaces.Discrete)
         actor = settings.get("actor", "mlp")
         self.seq_length: int = settings.get("seq_length", 1) if actor == "lstm" else 0
+        self.carries = actor == "lstm" and settings.get("carry_hidden", False)
         shape = {k: settings[k] for k in ("hidden_sizes", "activation") if k in settings}
         outputs = int(self.action_space.n) if self.discrete else self.action_space.shape[0]
         return ACTORS[actor](size, outputs, **shape, discrete=self.discrete)
@@ -122,11 +124,15 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     @override(TorchRLModule)
     def get_initial_state(self) -> dict[str, Tensor]:
-        """An empty window `(T, O)` and its mask `(T,)`; nothing unless the actor is an LSTM."""
+        """An empty window `(T, O)`, its mask `(T,)`, and `(H,)` h and c if carried; nothing but for an LSTM."""
         if not self.seq_length:
             return {}
         size = self.observation_space.shape[0]
-        return {"window": torch.zeros(self.seq_length, size), "mask": torch.zeros(self.seq_length)}
+        state = {"window": torch.zeros(self.seq_length, size), "mask": torch.zeros(self.seq_length)}
+        if self.carries:
+            assert isinstance(self.acting, LSTMActor)
+            state |= {name: torch.zeros(self.acting.from_hidden.in_features) for name in ("hidden", "cell")}
+        return state
 
     def greedy(self, output: Tensor) -> Tensor:
         """The actions of the network's outputs `(..., A)`: those outputs or, if discrete, the best one's number."""
@@ -150,15 +156,23 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
                     'batch["state_in"], get_initial_state() with a batch dimension at an episode\'s start and '
                     'the last call\'s "state_out" after that.'
                 )
-            window, mask = (
-                torch.as_tensor(batch[Columns.STATE_IN][k], dtype=torch.float32) for k in ("window", "mask")
+            window, mask, *carried = (
+                torch.as_tensor(batch[Columns.STATE_IN][k], dtype=torch.float32) for k in self.get_initial_state()
             )
+            hidden = torch.stack(carried, -2) if carried else None
             steps = []
             for now in obs.unsqueeze(1).unbind(1) if obs.dim() == 2 else obs.unbind(1):  # RLlib adds a time axis
                 window, mask = push(window, mask, now)
-                steps.append(network(self.normalizer(window), mask))
+                if hidden is None:
+                    steps.append(network(self.normalizer(window), mask))
+                else:
+                    assert isinstance(network, LSTMActor)
+                    hidden = network.carry(self.normalizer(window), mask, hidden)
+                    steps.append(network.head(hidden))
             outputs = steps[0] if obs.dim() == 2 else torch.stack(steps, dim=1)
             state = {"window": window, "mask": mask}
+            if hidden is not None:
+                state |= {"hidden": hidden[..., 0, :], "cell": hidden[..., 1, :]}
         actions = self.greedy(outputs) if t is None else self.explore(outputs, t)
         return {Columns.ACTIONS: actions} | ({Columns.STATE_OUT: state} if state else {})
 

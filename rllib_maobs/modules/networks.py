@@ -68,8 +68,8 @@ class LSTMActor(nn.Module):
     """Deterministic policy over a window of the last T observations (eq. 10).
 
     An LSTM cell takes the place of the first hidden layer and reads the window from its oldest observation to
-    its newest, from zero h and c; the other layers see its last h. Observations that the mask leaves out
-    (before the episode began) do not count: a masked window equals a shorter one. The cell is written
+    its newest, from zero h and c or from given ones; the other layers see its last h. Observations that the
+    mask leaves out (before the episode began) do not count: a masked window equals a shorter one. The cell is written
     with linear layers, so it can be stacked; its numbers are those of `nn.LSTM` with one bias.
 
     Args:
@@ -125,14 +125,36 @@ class LSTMActor(nn.Module):
         assert hidden is not None
         return hidden
 
-    def raw(self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    def raw(self, window: Tensor, mask: Tensor, hidden: Tensor | None = None) -> Tensor:
         """The last layer's output `(..., A)` for the window's last observation, not squashed."""
-        return self.layers(self.unroll(window, mask, hidden)[0])
+        return self.layers(self.unroll(window, mask, _pair(hidden))[0])
 
-    def forward(self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None) -> Tensor:
-        """Maps windows `(..., T, O)` and masks `(..., T)` to actions `(..., A)` in [-1, 1], or to discrete values."""
+    def forward(self, window: Tensor, mask: Tensor, hidden: Tensor | None = None) -> Tensor:
+        """Maps windows to actions, or to the values of discrete actions.
+
+        Args:
+            window: Observations, oldest first, `(..., T, O)`.
+            mask: Which of them count, `(..., T)`.
+            hidden: h and c to start from, `(..., 2, H)`; None for zeros.
+
+        Returns:
+            Actions in [-1, 1], or values, `(..., A)`.
+        """
         output = self.raw(window, mask, hidden)
         return output if self.discrete else torch.tanh(output)
+
+    def carry(self, window: Tensor, mask: Tensor, hidden: Tensor | None = None) -> Tensor:
+        """The h and c `(..., 2, H)` with which a window ends: the next one may start from them."""
+        return torch.stack(self.unroll(window, mask, _pair(hidden)), -2)
+
+    def head(self, hidden: Tensor) -> Tensor:
+        """What `forward` makes of the h and c `(..., 2, H)` with which its window ends."""
+        output = self.layers(hidden[..., 0, :])
+        return output if self.discrete else torch.tanh(output)
+
+
+def _pair(hidden: Tensor | None) -> tuple[Tensor, Tensor] | None:
+    return None if hidden is None else (hidden[..., 0, :], hidden[..., 1, :])
 
 
 def _tanh(x: Tensor) -> Tensor:
