@@ -329,16 +329,16 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         with self.metrics.log_time(RLMODULE_INFERENCE_TIMER), torch.no_grad():
             seen = [part.to(self.actors.flat.device) for part in seen]
             if self.normalizers is not None:
-                seen[0], dims[0] = self.normalizers(self.normalizers.params, (seen[0], dims[0])), 1
+                seen[0], dims[0] = self.normalizers.act((seen[0], dims[0])), 1
             method = "forward"
             if carries:  # h and c go on with the window, whatever chooses the actions
-                hidden = self.actors(self.actors.params, *zip(seen, dims, strict=True), method="carry")
+                hidden = self.actors.act(*zip(seen, dims, strict=True), method="carry")
                 assert self._window is not None
                 self._window = *self._window[:2], hidden.cpu()
                 seen, dims, method = [hidden], [1], "head"
             if random_actions:
                 return self._random(obs.shape[:2])
-            outputs = self._padded(self.actors(self.actors.params, *zip(seen, dims, strict=True), method=method).cpu())
+            outputs = self._padded(self.actors.act(*zip(seen, dims, strict=True), method=method).cpu())
             if explore:
                 actions = self._agent.explore(outputs, self.num_env_steps_sampled_lifetime, self._generator)
             else:

@@ -137,7 +137,9 @@ def test_one_agent_leaves_a_checkpoint_in_three_lines(ray_session: None, tmp_pat
     action = module.forward_inference({"obs": obs})["actions"]
 
     assert action.shape == (1, 5) and action.abs().max() <= 1
-    assert torch.equal(action, algo.get_module("agent_0").forward_inference({"obs": obs})["actions"])
+    # Alone its weights lie in another order in memory, which moves the last digit.
+    want = algo.get_module("agent_0").forward_inference({"obs": obs})["actions"]
+    torch.testing.assert_close(action, want, rtol=0.0, atol=1e-6)
     algo.stop()
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
+from torch.fx.experimental.proxy_tensor import make_fx
 
 Params = dict[str, Tensor]
 """Parameters of M networks by name, each `(M, *shape)`."""
@@ -59,6 +61,7 @@ class Stack:
         for row, net in enumerate(owners):
             for name, parameter in net.named_parameters():
                 _corner(self.params[name][row], parameter).copy_(parameter.detach())
+        self._recorded: dict[tuple[Any, ...], Callable[..., Tensor]] = {}
         self._bind()
 
     def _bind(self) -> None:
@@ -127,6 +130,23 @@ class Stack:
             same = one(single, *tensors).unsqueeze(1)
             return same.expand(-1, len(self.rows), *same.shape[2:])
         return vmap(one, in_dims=(None, *dims), out_dims=1)(single, *tensors)
+
+    @torch.no_grad()
+    def act(self, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
+        """`__call__` with the present parameters and without gradients, for one call after the other.
+
+        The plain tensor operations behind `vmap` are recorded at the first call for inputs of some shape, and played
+        back from then on: for small inputs most of the time of a call goes into finding them.
+        """
+        tensors, dims = zip(*inputs, strict=True)
+        key = (method, dims, *(tensor.shape for tensor in tensors))
+        if key not in self._recorded:
+
+            def call(params: Params, *tensors: Tensor) -> Tensor:
+                return self(params, *zip(tensors, dims, strict=True), method=method)
+
+            self._recorded[key] = make_fx(call)(self.params, *tensors).forward
+        return self._recorded[key](self.params, *tensors)
 
 
 def _corner(padded: Tensor, like: Tensor) -> Tensor:

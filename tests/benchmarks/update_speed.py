@@ -32,6 +32,8 @@ SHAPES = {
     "N=9 batch 32": ("maobs/spread-9a", 32, 3, 6.0, 0.75),
     "N=3 batch 128": ("maobs/spread-3a", 128, 5, 3.5, 0.75),
 }
+# What the loop over agents can learn.
+LOOPS = ("iddpg", "maddpg", "maddpg-l")
 # Least updates of the compiled learner for one of MADDPG's.
 AGAINST_MADDPG = {"maddpg-lstm": 0.3, "facmac": 0.7, "qmix": 0.7}
 
@@ -101,7 +103,7 @@ def measure(algorithm: str, shape: str, critic_state: str, rounds: int, seconds:
         "maddpg": stacked_update(maddpg, random_columns(maddpg.config, SHAPES[shape][1])),
         "end to end": train,
     }
-    if algorithm in ("iddpg", "maddpg", "maddpg-l"):
+    if algorithm in LOOPS:
         ways["loop"] = loop_update(algorithm, eager, columns)
     for work in ways.values():
         work()
