@@ -9,7 +9,7 @@ from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 from torch import nn
 
 import rllib_maobs as maobs
-from rllib_maobs.modules import Exploration, LSTMActor, Mixer
+from rllib_maobs.modules import Exploration, LSTMActor, Mixer, MLPActor, Stack
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointEnvRunner
 from tests.conftest import build_learner, random_columns, small_config
@@ -39,6 +39,29 @@ def test_one_observation_is_a_cell_from_zero(actor: LSTMActor) -> None:
         mine.data.copy_(theirs)
     h, _ = cell(obs[:, 0])
     torch.testing.assert_close(actor(obs, torch.ones(5, 1)), torch.tanh(actor.layers(h)))
+
+
+@pytest.mark.parametrize("network", [MLPActor, LSTMActor])
+def test_acting_plays_back_what_the_networks_would_do(network: type) -> None:
+    """To the bit, for every shape of inputs, with the parameters of the moment, of its own or another stack's."""
+    stack, other = (Stack([network(O, A, (H, 6)) for _ in range(3)]) for _ in range(2))
+
+    def inputs(copies: int) -> list[tuple[torch.Tensor, int | None]]:
+        if network is MLPActor:
+            return [(torch.randn(copies, 3, O), 1)]
+        return [(torch.randn(copies, 5, 3, O), 2), ((torch.rand(copies, 5) > 0.3).float(), None)]
+
+    def check(copies: int) -> None:
+        seen = inputs(copies)
+        action = stack.act(*seen)
+        assert torch.equal(action, stack(stack.params, *seen)) and not action.requires_grad
+
+    check(2)
+    check(7)
+    stack.flat.data.add_(0.1)
+    check(7)
+    stack.share(other)
+    check(7)
 
 
 def test_a_window_longer_than_the_episode_is_a_full_unroll(actor: LSTMActor) -> None:
