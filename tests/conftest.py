@@ -8,7 +8,8 @@ import ray
 import torch
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Columns, JointLearner
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Columns
 
 torch.set_num_threads(1)
 

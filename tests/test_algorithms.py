@@ -15,7 +15,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Columns
+from rllib_maobs.terms import Columns
 from tests.conftest import ALGORITHMS, small_config
 from tests.test_runner import TwoAgents
 

@@ -12,8 +12,9 @@ ALLOWED = {
     "modules": set(),
     "replay": set(),
     "runner": {"envs", "modules"},
-    "learner": {"modules"},
-    "algorithms": {"envs", "modules", "replay", "runner", "learner"},
+    "terms": {"modules"},
+    "learner": {"modules", "terms"},
+    "algorithms": {"envs", "modules", "replay", "runner", "terms", "learner"},
 }
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Columns, JointLearner, Nets
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Columns, Nets
 from tests.conftest import ALGORITHMS, random_columns, small_config
 from tests.equations import Equations
 from tests.reference import LoopLearner, whole_layers

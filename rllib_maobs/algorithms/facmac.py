@@ -10,8 +10,9 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
 from rllib_maobs.algorithms.config import Abilities, JointConfig, in_range, one_of
-from rllib_maobs.learner import Batch, JointLearner, Nets
+from rllib_maobs.learner import JointLearner
 from rllib_maobs.modules import Params
+from rllib_maobs.terms import Batch, Nets
 
 CRITIC_SOURCES = ("shared", "others", "own")
 LOCAL = "local"  # the training stage before the mixer

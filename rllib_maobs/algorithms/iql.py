@@ -11,8 +11,9 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
 from rllib_maobs.algorithms.config import Abilities, JointConfig
-from rllib_maobs.learner import Batch, JointLearner, Nets
+from rllib_maobs.learner import JointLearner
 from rllib_maobs.modules import Params, Stack, UtilityModule
+from rllib_maobs.terms import Batch, Nets
 
 
 class QLearner(JointLearner):

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
 from rllib_maobs.algorithms.config import JointConfig, one_of
-from rllib_maobs.learner import Batch, JointLearner, Nets
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Batch, Nets
 
 OTHER_AGENTS_ACTIONS = ("replay", "current", "joint")
 

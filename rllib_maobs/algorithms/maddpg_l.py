@@ -7,7 +7,8 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
 from rllib_maobs.algorithms.config import JointConfig
-from rllib_maobs.learner import Batch, JointLearner, Nets
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Batch, Nets
 
 
 class MADDPGLLearner(JointLearner):

@@ -42,7 +42,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from rllib_maobs.experiment.arguments import make_parser
 from rllib_maobs.experiment.trial import TrialSpec
-from rllib_maobs.learner import Columns, JointLearner
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Columns
 
 EXPERIMENTS = ["obstacle_predator_prey", "spread3a", "spread6a", "spread9a", "tunnel", "simple_tunnel"]
 EXPERIMENTS += ["simple_tunnel6a"]

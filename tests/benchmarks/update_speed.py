@@ -23,7 +23,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import Columns, JointLearner
+from rllib_maobs.learner import JointLearner
+from rllib_maobs.terms import Columns
 from tests.conftest import build_learner, random_columns
 from tests.reference import LoopLearner
 
