@@ -29,6 +29,7 @@ from rllib_maobs.terms import Batch, Columns, Nets, Terms
 MIXER = "mixer"
 NUM_UPDATES_LIFETIME = "num_updates_lifetime"
 _PROGRESS = "progress"
+_LAYOUT = 2  # how numbers lie in flat tensors (`Stack`), and so in the optimisers' saved state
 
 
 class JointLearner(Terms, TorchLearner):
@@ -401,12 +402,23 @@ class JointLearner(Terms, TorchLearner):
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """RLlib's state, the number of updates made and the random numbers to come."""
         state: dict[str, Any] = super().get_state(*args, **kwargs)
-        state[_PROGRESS] = {"updates": self._updates_lifetime, "generator": self._generator.get_state().numpy()}
+        generator = self._generator.get_state().numpy()
+        state[_PROGRESS] = {"updates": self._updates_lifetime, "generator": generator, "layout": _LAYOUT}
         return state
 
     @override(Learner)
     def set_state(self, state: dict[str, Any]) -> None:
-        """Goes on from a saved state."""
+        """Goes on from a saved state.
+
+        Raises:
+            ValueError: If a revision saved it whose optimisers' numbers lie in another order.
+        """
+        if _PROGRESS in state and state[_PROGRESS].get("layout") != _LAYOUT:
+            raise ValueError(
+                f"This learner's state was saved by an earlier revision of rllib-maobs, whose optimisers' numbers lie "
+                f"in another order (layout {state[_PROGRESS].get('layout', 1)}, here {_LAYOUT}): go on with it there, "
+                f"or take its trained agents with RLModule.from_checkpoint."
+            )
         super().set_state(state)
         self._bind()  # the optimisers' tensors are new ones
         if _PROGRESS in state:

@@ -460,3 +460,13 @@ def test_with_one_agent_all_algorithms_are_ddpg(make_learner: MakeLearner) -> No
         actors.append(learner.acting.flat.detach())
     for actor in actors:
         torch.testing.assert_close(actor, actors[0], rtol=1e-7, atol=1e-9)
+
+
+def test_a_state_in_another_layout_is_refused(make_learner: MakeLearner) -> None:
+    """Its numbers would fit, and be those of other parameters."""
+    learner = make_learner(small_config("maddpg"))
+    state = learner.get_state()
+    learner.set_state(state)
+    del state["progress"]["layout"]
+    with pytest.raises(ValueError, match=r"saved by an earlier revision.*layout 1, here 2.*RLModule\.from_checkpoint"):
+        learner.set_state(state)
