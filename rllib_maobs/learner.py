@@ -263,15 +263,19 @@ class JointLearner(Terms, TorchLearner):
         """`_gradients` as compiled code."""
         # Code of its own: compiled code is kept per code object, and not checked against what has changed.
         own = FunctionType(JointLearner._gradients.__code__.replace(), JointLearner._gradients.__globals__)
-        mode = self.config.torch_compile_learner_dynamo_mode
+        config = self.config
+        backend, mode = config.torch_compile_learner_dynamo_backend, config.torch_compile_learner_dynamo_mode
+        # `gradients` compiles anew for whatever changes between calls, so nothing need be checked at every one.
+        options: dict[str, Any] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
+        if backend == "inductor" and self._device.type == "cpu":
+            options["cpp_wrapper"] = True  # small kernels: Python between them would take a tenth of the time
         compiled: Callable[..., Any] = torch.compile(
             MethodType(own, self),
             fullgraph=True,
             dynamic=False,
-            backend=self.config.torch_compile_learner_dynamo_backend,
+            backend=backend,
             mode=mode,
-            # `gradients` compiles anew for whatever changes between calls, so nothing need be checked at every one.
-            options=None if mode else {"cpp_wrapper": True, "guard_filter_fn": torch.compiler.skip_all_guards_unsafe},
+            options=None if mode else options,
         )
         return compiled
 

@@ -14,7 +14,7 @@ It prints a table per part, draws a figure of them, and exits with 1 if a bar is
 - two: two such trials at once, each bound to a core with its Ray, against one alone, in turns; medians of the rounds.
 
 Every configuration runs in a process of its own, bound to a core (runners: free on two). Two at once start and compile,
-which takes some 30 s, but one at a time is measured. All parts take some 15 minutes on two free cores. Progress goes to
+which takes some 30 s, but one at a time is measured. All parts take some 12 minutes on two free cores. Progress goes to
 stderr, with the share of a core's time that a process had while it was measured: on a busy machine it is below 1, and
 the numbers say little.
 """
