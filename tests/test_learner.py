@@ -302,6 +302,17 @@ def test_learners_of_one_process_do_not_share_compiled_code(make_learner: MakeLe
             torch.testing.assert_close(pieces, eager[role], rtol=1e-4, atol=1e-5)
 
 
+def test_every_batch_size_is_compiled_on_its_own(make_learner: MakeLearner) -> None:
+    """Compiled code checks no sizes when it is called; other compilers than Inductor serve as well."""
+    framework = {"torch_compile_learner": True, "torch_compile_learner_dynamo_backend": "aot_eager"}
+    compiled = make_learner(small_config("maddpg").framework(**framework))
+    for size in (32, 12):
+        columns = random_columns(compiled.config, size=size)
+        want, _ = compiled._gradients(compiled.nets(), compiled.nets(target=True), {}, columns)
+        for role, pieces in compiled.gradients(columns)[0].items():
+            torch.testing.assert_close(pieces, want[role], rtol=1e-4, atol=1e-5)
+
+
 def test_targets_start_equal_to_the_online_networks(ray_session: None) -> None:
     for algorithm in ("maddpg", "qmix"):
         algo = small_config(algorithm).build_algo()

@@ -29,7 +29,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 from typing import Any
@@ -49,8 +48,12 @@ EXPERIMENTS = ["obstacle_predator_prey", "spread3a", "spread6a", "spread9a", "tu
 EXPERIMENTS += ["simple_tunnel6a"]
 PARTS = ["acting", "env", "replay", "update", "evaluation", "RLlib"]
 HOURS, RLLIB_SHARE = 24.0, 0.2  # bars
-PRODUCTS = {torch.ops.aten.mm: (0, 1), torch.ops.aten.bmm: (0, 1), torch.ops.aten.addmm: (1, 2)} | {
-    torch.ops.aten.baddbmm: (1, 2)
+# Matrix products, and which of their arguments are the factors.
+PRODUCTS = {
+    torch.ops.aten.mm: (0, 1),
+    torch.ops.aten.bmm: (0, 1),
+    torch.ops.aten.addmm: (1, 2),
+    torch.ops.aten.baddbmm: (1, 2),
 }
 
 
@@ -206,7 +209,7 @@ def run_cell(experiment: str, algorithm: str, critic_state: str, seconds: float)
         ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         maobs.register()
         spec, steps = spec_of(experiment, algorithm, critic_state)
-        result = measure(replace(spec, seed=0), seconds)
+        result = measure(spec, seconds)
         ray.shutdown()
     print(json.dumps({**result, "steps": steps}))
 
