@@ -154,16 +154,21 @@ class CheckpointPolicy:
                 f"--policy {str(checkpoint)!r} is illegal; legal: random, heuristic, or the folder of an RLlib "
                 f"algorithm checkpoint (with modules in {'/'.join(_MODULES)})"
             )
-        policy_of = _policy_mapping(checkpoint)
-        self._module_of = {agent: policy_of(agent) for agent in env.possible_agents}
+        config = _saved_config(checkpoint)
+        self._module_of = {agent: str(config["policy_mapping_fn"](agent, None)) for agent in env.possible_agents}
         for agent, module_id in self._module_of.items():
             if module_id not in found:
                 raise ValueError(f"checkpoint {checkpoint} has no module for {agent}; it has {', '.join(found)}")
         self._modules = {m: RLModule.from_checkpoint(folder / m) for m in sorted(set(self._module_of.values()))}
+        # What observations begin with: the agent's number as a one-hot vector if it was trained so, else nothing.
+        size = len(env.possible_agents) if config.get("agent_id_input", False) else 0
+        numbers = np.eye(len(env.possible_agents), size, dtype=np.float32)
+        self._ids = dict(zip(env.possible_agents, numbers, strict=True))
         for agent, module_id in self._module_of.items():
-            trained, here = self._modules[module_id].observation_space.shape, env.observation_space(agent).shape
+            (here,) = env.observation_space(agent).shape
+            trained = self._modules[module_id].observation_space.shape[0] - len(self._ids[agent])
             if trained != here:
-                raise ValueError(f"{agent} observes {here} in {env.scenario}, but was trained on {trained}")
+                raise ValueError(f"{agent} observes ({here},) in {env.scenario}, but was trained on ({trained},)")
         self._spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
         self._states: dict[str, Any] = {}
 
@@ -181,7 +186,8 @@ class CheckpointPolicy:
         from ray.rllib.utils.spaces.space_utils import unsquash_action
 
         module, space = self._modules[self._module_of[agent]], self._spaces[agent]
-        batch: dict[str, Any] = {Columns.OBS: torch.from_numpy(observation)[None]}
+        seen = np.concatenate([self._ids[agent], observation])
+        batch: dict[str, Any] = {Columns.OBS: torch.from_numpy(seen)[None]}
         if module.is_stateful():
             if agent not in self._states:
                 start = module.get_initial_state()
@@ -200,11 +206,9 @@ class CheckpointPolicy:
         return unsquash_action(flat, space) if space.shape else int(flat)
 
 
-def _policy_mapping(checkpoint: Path) -> Callable[[str], str]:
-    """Return the module id of an agent id, as the checkpoint's algorithm was configured."""
-    arguments = pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())["ctor_args_and_kwargs"]
-    mapping = arguments[0][0]["policy_mapping_fn"]
-    return lambda agent: str(mapping(agent, None))
+def _saved_config(checkpoint: Path) -> Any:
+    """Return the settings of a checkpoint's algorithm, by name."""
+    return pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())["ctor_args_and_kwargs"][0][0]
 
 
 def _film(env: MAObsParallelEnv, recorder: Recorder | None) -> None:

@@ -127,6 +127,26 @@ def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
         make_policy(parallel_env("spread-3a", num_agents=4), path)
 
 
+def test_checkpoint_of_agents_that_share_parameters_and_know_their_numbers(ray_session, tmp_path):
+    config = small_config("maddpg").training(agent_id_input=True)
+    config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *args, **kwargs: "all")
+    algo = config.build_algo()
+    path, module = algo.save_to_path(str(tmp_path)), algo.get_module("all")
+    env = parallel_env("spread-3a")
+    policy = make_policy(env, path)
+    observations, _ = env.reset(seed=0)
+    alike = {agent: observations["agent_0"] for agent in observations}
+    actions = policy(alike)
+    for index, agent in enumerate(alike):
+        seen = np.append(np.eye(3, dtype=np.float32)[index], alike[agent])
+        expected = module.forward_inference({"obs": torch.from_numpy(seen)[None]})["actions"][0]
+        np.testing.assert_allclose(actions[agent], expected.detach().numpy(), rtol=1e-5, atol=1e-6)
+    assert not np.allclose(actions["agent_0"], actions["agent_1"])
+    algo.stop()
+    with pytest.raises(ValueError, match=r"agent_0 observes \(34,\) in Spread\(.*but was trained on \(18,\)"):
+        make_policy(parallel_env("spread-3a", num_agents=3, num_obstacles=10), path)
+
+
 def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
     """Predators share a policy, the learned prey has another, with another observation."""
     options = {"prey": "learned", "horizon": 5}
