@@ -235,6 +235,7 @@ class PictureAgents(TwoAgents):
         (lambda c: c.training(reward_scale=float("nan")), r"reward_scale must be a finite number"),
         (lambda c: c.rl_module(model_config={"activation": "step"}), r"activation'\] must be one of 'relu', 'tanh'"),
         (lambda c: c.rl_module(model_config={"hidden_sizes": ()}), r"hidden_sizes'\] must be positive integers"),
+        (lambda c: c.rl_module(model_config={"lstm_cell_size": 0}), r"lstm_cell_size'\] must be a positive integer"),
         (lambda c: c.rl_module(model_config={"hiden": (8,)}), r"Unknown model_config setting 'hiden'; legal are"),
         (lambda c: c.learners(num_learners=1), r"num_learners must be 0, not 1"),
         (

@@ -20,7 +20,7 @@ O, A, H = 4, 2, 8  # noqa: E741
 @pytest.fixture
 def actor() -> LSTMActor:
     torch.manual_seed(0)
-    return LSTMActor(O, A, (H, 6))
+    return LSTMActor(O, A, (5, 6), cell_size=H)
 
 
 def as_torch_lstm(actor: LSTMActor) -> nn.LSTM:
@@ -92,6 +92,17 @@ def test_a_carried_state_goes_on(actor: LSTMActor) -> None:
     hidden = actor.carry(window[:, :4], mask[:, :4])
     torch.testing.assert_close(actor(window[:, 4:], mask[:, 4:], hidden), actor(window, mask))
     torch.testing.assert_close(actor.head(actor.carry(window[:, 4:], mask[:, 4:], hidden)), actor(window, mask))
+
+
+def test_the_cell_has_a_size_of_its_own(ray_session: None) -> None:
+    """The layers after it and the critic keep theirs; agents saved before there was the setting load as they were."""
+    config = small_config("maddpg-lstm").training(carry_hidden=True).rl_module(model_config={"lstm_cell_size": 5})
+    module = build_learner(config).module["agent_0"]
+    assert config.hidden_size == module.actor.from_hidden.in_features == module.actor.layers[0].in_features == 5
+    assert [module.actor.layers[0].out_features, module.critic.from_state.out_features] == [64, 64]
+    old = {name: value for name, value in module.model_config.items() if name != "lstm_cell_size"}
+    spaces = {"observation_space": module.observation_space, "action_space": module.action_space}
+    assert maobs.AgentModule(**spaces, model_config=old).actor.from_hidden.in_features == 64
 
 
 @pytest.mark.parametrize("carried", [False, True])

@@ -23,6 +23,7 @@ CRITIC_STATES = ("observations", "world")
 _MODEL_SETTINGS = (
     "hidden_sizes",
     "activation",
+    "lstm_cell_size",
     "actor",
     "seq_length",
     "carry_hidden",
@@ -168,8 +169,8 @@ class JointConfig(AlgorithmConfig):
         """Sets the training settings.
 
         Hidden sizes and activation are RLlib's to set: `config.rl_module(model_config={"hidden_sizes": (64, 64, 64),
-        "activation": "relu"})`. Parameter sharing is RLlib's policy mapping: agents with one policy share its
-        networks.
+        "activation": "relu", "lstm_cell_size": 64})`. Parameter sharing is RLlib's policy mapping: agents with one
+        policy share its networks.
 
         Args:
             actor_lr: Learning rate of the actors, or an RLlib schedule over env steps `[[0, 1e-3], ...]`.
@@ -245,6 +246,9 @@ class JointConfig(AlgorithmConfig):
         hidden = settings["hidden_sizes"]
         if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
             raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
+        cell = settings["lstm_cell_size"]
+        if not isinstance(cell, int) or cell < 1:
+            raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}.")
         if self.num_learners > 0:
             raise ValueError(
                 f"num_learners must be 0, not {self.num_learners}: a stacked update of all agents runs in the "
@@ -360,7 +364,7 @@ class JointConfig(AlgorithmConfig):
     @property
     def hidden_size(self) -> int:
         """H, the size of the h and c that are carried and stored; 0 if they are not."""
-        return self.model_config["hidden_sizes"][0] if self.carry_hidden else 0
+        return self.model_config["lstm_cell_size"] if self.carry_hidden else 0
 
     def critic_sizes(self, agent: str) -> tuple[int, int] | None:
         """Widths of what one agent's critic sees, of the state and of the actions; None if there are no critics."""
@@ -376,6 +380,7 @@ class JointConfig(AlgorithmConfig):
         return {
             "hidden_sizes": (64, 64, 64),
             "activation": "relu",
+            "lstm_cell_size": 64,
             "actor": self.actor,
             "seq_length": self.seq_length,
             "carry_hidden": self.carry_hidden,

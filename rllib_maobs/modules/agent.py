@@ -57,10 +57,10 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     state = out["state_out"]
     ```
 
-    Settings (`model_config`): `hidden_sizes`, `activation`, `actor` ("mlp" or "lstm"), `seq_length` (T),
-    `carry_hidden`, `exploration` (see `Exploration`), `normalize_observations`, and `critic_state_size`,
-    `critic_action_size`, `num_critics`: the widths of what the algorithm's critic sees and how many there are of
-    it. Without the critic's sizes the module has no critic: enough for acting.
+    Settings (`model_config`): `hidden_sizes`, `activation`, `actor` ("mlp" or "lstm"), `lstm_cell_size` (H),
+    `seq_length` (T), `carry_hidden`, `exploration` (see `Exploration`), `normalize_observations`, and
+    `critic_state_size`, `critic_action_size`, `num_critics`: the widths of what the algorithm's critic sees and how
+    many there are of it. Without the critic's sizes the module has no critic: enough for acting.
     """
 
     actor: MLPActor | LSTMActor
@@ -92,7 +92,9 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         actor = settings.get("actor", "mlp")
         self.seq_length: int = settings.get("seq_length", 1) if actor == "lstm" else 0
         self.carries = actor == "lstm" and settings.get("carry_hidden", False)
-        shape = {k: settings[k] for k in ("hidden_sizes", "activation") if k in settings}
+        shape: dict[str, Any] = {k: settings[k] for k in ("hidden_sizes", "activation") if k in settings}
+        if actor == "lstm":
+            shape["cell_size"] = settings.get("lstm_cell_size")
         outputs = int(self.action_space.n) if self.discrete else self.action_space.shape[0]
         return ACTORS[actor](size, outputs, **shape, discrete=self.discrete)
 

@@ -75,9 +75,10 @@ class LSTMActor(nn.Module):
     Args:
         observation_size: O.
         action_size: A, length of the action, or the number of discrete actions.
-        hidden_sizes: H, size of h and c, then the width of each further hidden layer.
+        hidden_sizes: Width of each hidden layer; the cell takes the place of the first.
         activation: Of the further layers, a key of `ACTIVATIONS`.
         discrete: Whether the output is a value for each discrete action instead of an action.
+        cell_size: H, size of h and c; None for that of the layer whose place the cell takes.
     """
 
     def __init__(
@@ -87,15 +88,16 @@ class LSTMActor(nn.Module):
         hidden_sizes: Sequence[int] = (64, 64, 64),
         activation: str = "relu",
         discrete: bool = False,
+        cell_size: int | None = None,
     ) -> None:
         super().__init__()
         self.discrete = discrete
-        size = hidden_sizes[0]
+        size = cell_size or hidden_sizes[0]
         self.from_observation = nn.Linear(observation_size, 4 * size)
         self.from_hidden = nn.Linear(size, 4 * size, bias=False)
         for parameter in self.parameters():  # nn.LSTM's own way to start
             nn.init.uniform_(parameter, -(size**-0.5), size**-0.5)
-        self.layers = mlp((*hidden_sizes, action_size), activation)
+        self.layers = mlp((size, *hidden_sizes[1:], action_size), activation)
 
     def unroll(
         self, window: Tensor, mask: Tensor, hidden: tuple[Tensor, Tensor] | None = None
