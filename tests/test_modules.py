@@ -41,6 +41,35 @@ def test_one_observation_is_a_cell_from_zero(actor: LSTMActor) -> None:
     torch.testing.assert_close(actor(obs, torch.ones(5, 1)), torch.tanh(actor.layers(h)))
 
 
+@pytest.mark.parametrize("users", ["abc", "aaa", "abb", "aba", "aabb", "abab", "abcabd", "aabbcd"])
+def test_agents_that_share_networks_in_any_way(users: str) -> None:
+    """A stack's values and gradients are those of each agent calling its network, whatever the agents see alike."""
+    torch.manual_seed(0)
+    networks = {name: maobs.Critic(O, A, (H, 6)).double() for name in sorted(set(users))}
+    own = [networks[name] for name in users]
+    stack = Stack(own, ("value",))
+    each, same = torch.randn(5, len(users), H).double(), torch.randn(5, H).double()
+    action, joint = torch.randn(5, len(users), A).double(), torch.randn(5, A).double()
+    for encoded, u in ((each, action), (each, joint), (same, action), (same, joint)):
+
+        def of(tensor: torch.Tensor, agent: int) -> torch.Tensor:
+            return tensor[:, agent] if tensor.dim() == 3 else tensor
+
+        inputs = [(tensor, 1 if tensor.dim() == 3 else None) for tensor in (encoded, u)]
+        expected = torch.stack([net.value(of(encoded, i), of(u, i)) for i, net in enumerate(own)], 1)
+        torch.testing.assert_close(stack(stack.params, *inputs, method="value"), expected)
+        torch.testing.assert_close(stack.act(*inputs, method="value"), expected.detach())
+        weights = torch.arange(1.0, len(users) + 1).double()[:, None]
+        flat = stack.flat.detach().requires_grad_()
+        value = (stack(stack.unflatten(flat), *inputs, method="value") * weights).sum()
+        gradient = stack.unflatten(torch.autograd.grad(value, flat)[0])
+        for name, network in networks.items():
+            parameters = dict(network.rest.named_parameters(prefix="rest"))
+            wanted = torch.autograd.grad((expected * weights).sum(), list(parameters.values()), retain_graph=True)
+            for key, want in zip(parameters, wanted, strict=True):
+                torch.testing.assert_close(gradient[key][stack.rows[users.index(name)]], want)
+
+
 @pytest.mark.parametrize("network", [MLPActor, LSTMActor])
 def test_acting_plays_back_what_the_networks_would_do(network: type) -> None:
     """To the bit, for every shape of inputs, with the parameters of the moment, of its own or another stack's."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,13 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 Params = dict[str, Tensor]
 """Parameters of M networks by name, each `(M, *shape)`."""
+
+
+class _Group(NamedTuple):
+    """Networks that equally many agents use."""
+
+    rows: list[int]  # of the networks
+    agents: list[int]  # who uses the first of them, then the second, ...
 
 
 class Stack:
@@ -44,6 +51,14 @@ class Stack:
             raise ValueError("Networks with buffers (e.g. BatchNorm) cannot be stacked; use LayerNorm instead.")
         self.networks = list(networks)
         self.rows = [0 if tie else next(i for i, d in enumerate(distinct) if d is net) for net in networks]
+        users = [[agent for agent, own in enumerate(self.rows) if own == row] for row in range(max(self.rows) + 1)]
+        self._groups = [
+            _Group(rows, [agent for row in rows for agent in users[row]])
+            for count in dict.fromkeys(map(len, users))
+            if (rows := [row for row, own in enumerate(users) if len(own) == count])
+        ]
+        order = [agent for group in self._groups for agent in group.agents]
+        self._places = [order.index(agent) for agent in range(len(order))]
         owners = distinct[: 1 if tie else None]
         # The first network only lends its code; functional_call puts the stacked parameters in its own's place.
         self._methods = {name: _Method(networks[0], name) for name in methods}
@@ -67,7 +82,6 @@ class Stack:
     def _bind(self) -> None:
         """Makes `params` and every network's own parameters views of `flat`."""
         self.params = self.unflatten(self.flat.detach())
-        self._index = torch.tensor(self.rows, device=self.flat.device)
         for row, net in zip(self.rows, self.networks, strict=True):
             for name, parameter in net.named_parameters():
                 parameter.data = _corner(self.params[name][row], parameter)
@@ -99,10 +113,6 @@ class Stack:
         """The pieces of stacked parameters (or gradients) by name, a vector each; copied only if they lie otherwise."""
         return [(p if p.dim() < 3 else p.mT).reshape(-1) for p in (params[name] for name in self._shapes)]
 
-    def spread(self, rows: Tensor, dim: int = 0) -> Tensor:
-        """What is there for each row, along a dimension, for each agent instead: the same if nothing is shared."""
-        return rows if self.rows == list(range(len(self.rows))) else rows.index_select(dim, self._index)
-
     def __call__(self, params: Params, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
         """Applies all agents' networks at once.
 
@@ -115,21 +125,35 @@ class Stack:
         Returns:
             The output, with the N agents at dimension 1: `(B, N, ...)`.
         """
-        tensors, dims = zip(*inputs, strict=True)
+        outputs = [self._call(group, params, inputs, method) for group in self._groups]
+        return _take(outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=1), self._places, 1)
+
+    def _call(self, group: _Group, params: Params, inputs: Sequence[tuple[Tensor, int | None]], method: str) -> Tensor:
+        """The output for one group's agents, in its order."""
+        networks, users = len(group.rows), len(group.agents) // len(group.rows)
+        own = {name: _take(value, group.rows, 0) for name, value in params.items()}
+        tensors = [tensor if dim is None else _take(tensor, group.agents, dim) for tensor, dim in inputs]
+        dims = [dim for _, dim in inputs]
 
         def one(p: Params, *args: Tensor) -> Tensor:
             return functional_call(self._methods[method], {f"net.{k}": v for k, v in p.items()}, args)
 
-        alone = len(self.rows) > 1 and set(self.rows) == {0}
-        if not alone:
-            each = {name: self.spread(value) for name, value in params.items()}
-            return vmap(one, in_dims=(0, *dims), out_dims=1)(each, *tensors)
-        # One network for all: its weights meet all agents' inputs in one product.
-        single = {name: value[0] for name, value in params.items()}
-        if all(dim is None for dim in dims):
-            same = one(single, *tensors).unsqueeze(1)
-            return same.expand(-1, len(self.rows), *same.shape[2:])
-        return vmap(one, in_dims=(None, *dims), out_dims=1)(single, *tensors)
+        def shared(p: Params, *args: Tensor) -> Tensor:
+            """One network for all its users: its weights meet all their inputs in one product."""
+            if any(dim is not None for dim in dims):
+                return vmap(one, in_dims=(None, *dims), out_dims=1)(p, *args)
+            same = one(p, *args).unsqueeze(1)
+            return same.expand(-1, users, *same.shape[2:])
+
+        if users == 1:
+            return vmap(one, in_dims=(0, *dims), out_dims=1)(own, *tensors)
+        if networks == 1:
+            return shared({name: value[0] for name, value in own.items()}, *tensors)
+        tensors = [
+            tensor if dim is None else tensor.unflatten(dim, (networks, users))
+            for tensor, dim in zip(tensors, dims, strict=True)
+        ]
+        return vmap(shared, in_dims=(0, *dims), out_dims=1)(own, *tensors).flatten(1, 2)
 
     @torch.no_grad()
     def act(self, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
@@ -147,6 +171,14 @@ class Stack:
 
             self._recorded[key] = make_fx(call)(self.params, *tensors).forward
         return self._recorded[key](self.params, *tensors)
+
+
+def _take(tensor: Tensor, positions: list[int], dim: int) -> Tensor:
+    """The entries at some positions along a dimension: a view if they are neighbours."""
+    start, count = positions[0], len(positions)
+    if positions == list(range(start, start + count)):
+        return tensor if count == tensor.shape[dim] else tensor.narrow(dim, start, count)
+    return tensor.index_select(dim, torch.tensor(positions, device=tensor.device))
 
 
 def _corner(padded: Tensor, like: Tensor) -> Tensor:
