@@ -169,7 +169,7 @@ class JointConfig(AlgorithmConfig):
         """Sets the training settings.
 
         Hidden sizes and activation are RLlib's to set: `config.rl_module(model_config={"hidden_sizes": (64, 64, 64),
-        "activation": "relu", "lstm_cell_size": 64})`. Parameter sharing is RLlib's policy mapping: agents with one
+        "activation": "relu", "lstm_cell_size": 48})`. Parameter sharing is RLlib's policy mapping: agents with one
         policy share its networks.
 
         Args:
@@ -248,7 +248,7 @@ class JointConfig(AlgorithmConfig):
             raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
         cell = settings["lstm_cell_size"]
         if not isinstance(cell, int) or cell < 1:
-            raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}.")
+            raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 48, not {cell!r}.")
         if self.num_learners > 0:
             raise ValueError(
                 f"num_learners must be 0, not {self.num_learners}: a stacked update of all agents runs in the "
@@ -380,7 +380,7 @@ class JointConfig(AlgorithmConfig):
         return {
             "hidden_sizes": (64, 64, 64),
             "activation": "relu",
-            "lstm_cell_size": 64,
+            "lstm_cell_size": 48,
             "actor": self.actor,
             "seq_length": self.seq_length,
             "carry_hidden": self.carry_hidden,
