@@ -112,9 +112,11 @@ class LSTMActor(nn.Module):
         Returns:
             The last h and c, `(..., H)` each.
         """
+        # Transposed once, not at every step: so the steps' gradients add up as they lie in memory.
+        from_observation, from_hidden = self.from_observation.weight.mT, self.from_hidden.weight.mT
         for observation, counts in zip(window.unbind(-2), mask.unbind(-1), strict=True):
-            here = self.from_observation(observation)
-            i, f, g, o = (here if hidden is None else here + self.from_hidden(hidden[0])).chunk(4, dim=-1)
+            gates = observation @ from_observation + self.from_observation.bias
+            i, f, g, o = (gates if hidden is None else gates + hidden[0] @ from_hidden).chunk(4, dim=-1)
             c = torch.sigmoid(i) * _tanh(g)
             if hidden is not None:
                 c = c + torch.sigmoid(f) * hidden[1]
