@@ -19,7 +19,8 @@ class MADDPGLSTMConfig(MADDPGConfig):
     Eq. 10: u_a = mu_a({o_a^(t-i)}, i = 0..T-1), an LSTM over the last `seq_length` observations (`LSTMActor`) that
     starts every window from zero h and c, when it acts and when it learns alike. Windows never cross a reset,
     and one at an episode's start is as long as the episode so far. Critics and both losses are MADDPG's (eq. 2
-    and 3); the target actors' windows end one step later. Any algorithm here takes `actor="lstm"`.
+    and 3); the target actors' windows end one step later. Any algorithm here takes `actor="lstm"`. The paper does not
+    give the LSTM's size: it is `lstm_cell_size`, 48 units unless `rl_module(model_config={...})` says otherwise.
 
     With `carry_hidden=True` it is eq. 10 to the letter, u_a = mu_a({o_a^(t-i)}, h^(t-1), c^(t-1)): the window at step t
     starts from the h and c with which the one at t-1 ended, which learning takes from replay as acting had them. They
