@@ -13,6 +13,7 @@ from pettingzoo.test import parallel_api_test
 from rllib_maobs.envs import (
     SCENARIOS,
     Bodies,
+    Entities,
     Outcome,
     Range,
     Scenario,
@@ -63,8 +64,8 @@ class Home(Scenario[HomeOptions]):
         return np.stack([rng.uniform(-1, 1, (self.options.num_agents, 2)) for rng in rngs])
 
     @property
-    def observation_size(self):
-        return 4
+    def observation_layout(self):
+        return (Entities("self", 1, 4),)
 
     def observe(self, world, out):
         out[..., 0:2] = world.velocity

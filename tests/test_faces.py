@@ -43,17 +43,17 @@ def test_shapes_dtypes_and_spaces(scenario_id, mode):
 
 def test_states(scenario_id):
     env = make_vec(scenario_id, num_envs=2)
-    obs, _ = env.reset(seed=0)
-    world = np.concatenate(
-        [env.world.position.reshape(2, -1), env.world.velocity[:, : env.world.num_movers].reshape(2, -1)],
-        axis=1,
-    )
+    env.reset(seed=0)
+    env.world.velocity += 0.5
+    obs, movers = env.observe(), env.world.num_movers
+    moving = np.concatenate([env.world.position[:, :movers], env.world.velocity[:, :movers]], axis=-1)
+    world = np.concatenate([moving.reshape(2, -1), env.world.position[:, movers:].reshape(2, -1)], axis=1)
     np.testing.assert_array_equal(env.state(), obs.reshape(2, -1))
     np.testing.assert_array_equal(env.state("world"), world.astype(np.float32))
     assert env.state("world").shape == (2, env.state_size("world"))
     assert env.state("observations").shape == (2, env.state_size("observations"))
     by_option = make_vec(scenario_id, num_envs=2, state="world")
-    by_option.reset(seed=0)
+    env.reset(seed=0), by_option.reset(seed=0)
     np.testing.assert_array_equal(by_option.state(), env.state("world"))
     with pytest.raises(ValueError, match="legal: 'observations', 'world'"):
         env.state("wrld")

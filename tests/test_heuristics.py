@@ -75,6 +75,29 @@ def test_random_returns_of_the_tables(scenario_id, options, expected):
     assert f"{expected}" in type(env.scenario).__doc__
 
 
+@pytest.mark.parametrize(
+    ("scenario_id", "options", "expected", "success", "collision_free"),
+    [
+        ("spread-3a", {}, -35, 0.99, 0.98),
+        ("spread-6a", {}, -79, 0.97, 0.79),
+        ("spread-9a", {}, -138, 0.96, 0.51),
+        ("tunnel", {}, -208, 1.0, 1.0),
+        ("simple-tunnel", {}, -32, 1.0, 1.0),
+        ("simple-tunnel-6a", {}, -53, 1.0, 1.0),
+        (PREY, {}, 782, 1.0, 0.54),
+        (PREY, {"prey": "flee"}, 192, 1.0, 0.11),
+    ],
+)
+def test_heuristic_returns_of_the_tables(scenario_id, options, expected, success, collision_free):
+    """The same 200 episodes as in the docstrings; contacts amplify what a processor rounds otherwise."""
+    env = make_vec(scenario_id, num_envs=1 if "tunnel" in scenario_id else 200, **options)
+    total, metrics = play(env)
+    assert total == pytest.approx(expected, rel=0.03)
+    assert metrics["success"] == pytest.approx(success, abs=0.015)
+    assert metrics["collision_free"] == pytest.approx(collision_free, abs=0.04)
+    assert f"{expected}" in type(env.scenario).__doc__
+
+
 def test_heuristic_of_a_copy_does_not_depend_on_the_others():
     for scenario_id in SCENARIOS:
         many, single = make_vec(scenario_id, num_envs=5), make_vec(scenario_id)
@@ -134,7 +157,7 @@ def test_discrete_actions_follow_the_larger_component():
     assert scenario.actions(control).tolist() == [[0, 1, 2, 3, 4]]
 
 
-def test_assignment_is_one_to_one_and_short():
+def test_assignment_is_one_to_one_and_the_shortest():
     """Against the best of all permutations."""
     rng = np.random.default_rng(0)
     agents, targets = rng.uniform(-1, 1, (2, 50, 5, 2))
@@ -144,8 +167,7 @@ def test_assignment_is_one_to_one_and_short():
     orders = np.array(list(permutations(range(5))))
     best = (distance[:, np.arange(5), orders] ** 2).sum(axis=-1).min(axis=1)
     found = (np.take_along_axis(distance, goal[..., None], axis=2) ** 2).sum(axis=(1, 2))
-    assert (found >= best - 1e-12).all()
-    assert (found < best * 1.001).mean() > 0.8 and found.sum() < 1.02 * best.sum()
+    np.testing.assert_allclose(found, best, rtol=1e-12)
 
 
 def test_scenario_without_heuristic_says_so():

@@ -1,6 +1,5 @@
 """Multi-agent obstacle-avoidance tasks: one simulator, three faces (arrays, PettingZoo, RLlib)."""
 
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.pettingzoo_env import MAObsParallelEnv, parallel_env
 from rllib_maobs.envs.predator_prey import PredatorPrey
 from rllib_maobs.envs.recording import Recorder
@@ -12,11 +11,15 @@ from rllib_maobs.envs.spread import Spread
 from rllib_maobs.envs.tunnel import Tunnel
 from rllib_maobs.envs.vector import VectorEnv
 from rllib_maobs.envs.world import Bodies, Wall, World
+from rllib_maobs.layout import Entities, Layout, split
+from rllib_maobs.options import Range
 
 __all__ = [
     "SCENARIOS",
     "Bodies",
+    "Entities",
     "EpisodeMetricsCallback",
+    "Layout",
     "MAObsEnv",
     "MAObsParallelEnv",
     "Outcome",
@@ -35,4 +38,5 @@ __all__ = [
     "make_vec",
     "parallel_env",
     "register_scenario",
+    "split",
 ]

@@ -7,9 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
 from rllib_maobs.envs.world import Bodies, FloatArray, World
+from rllib_maobs.layout import Entities, Layout, split
+from rllib_maobs.options import Range
 
 Positive = Range(0.0, exclusive=True)
 TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
@@ -53,7 +54,13 @@ class Coverage(Scenario[OptionsT]):
         super().__init__(**options)
         groups = self.bodies()
         self._names = [f"{group.name}_{i}" for group in groups for i in range(group.count)]
-        n, self._num_obstacles = groups[0].count, groups[1].count
+        n, m = groups[0].count, groups[1].count
+        self._observation_layout = (
+            Entities("self", 1, 4),
+            Entities("target", n, 2, position=2),
+            Entities("obstacle", m, 2, position=2),
+            Entities("agent", n - 1, 2, position=2),
+        )
         self._others = others(n, len(self._names))
 
     def _make_bodies(self, num_obstacles: int) -> list[Bodies]:
@@ -65,20 +72,19 @@ class Coverage(Scenario[OptionsT]):
         ]
 
     @property
-    def observation_size(self) -> int:
-        """O."""
-        n = self.options.num_agents
-        return 4 + 2 * n + 2 * self._num_obstacles + 2 * (n - 1)
+    def observation_layout(self) -> Layout:
+        """Own velocity and position, then offsets of targets, obstacles, other agents."""
+        return self._observation_layout
 
     def observe(self, world: World, out: NDArray[np.float32]) -> None:
-        """Write velocity, position, targets, obstacles, other agents."""
-        e, n, m = world.num_envs, self.options.num_agents, self._num_obstacles
-        relative = world.offset.reshape(e, n, -1)  # (E, N, 2K)
-        out[..., 0:2] = world.velocity[:, :n]
-        out[..., 2:4] = world.position[:, :n]
-        out[..., 4 : 4 + 2 * n] = relative[..., 2 * (n + m) :]
-        out[..., 4 + 2 * n : 4 + 2 * n + 2 * m] = relative[..., 2 * n : 2 * (n + m)]
-        out[..., 4 + 2 * n + 2 * m :] = world.offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, -1)
+        """Write velocity and position, targets, obstacles, other agents."""
+        e, n, offset = world.num_envs, self.options.num_agents, world.offset
+        parts = split(self._observation_layout, out)
+        parts["self"][:, :, 0, 0:2] = world.velocity[:, :n]
+        parts["self"][:, :, 0, 2:4] = world.position[:, :n]
+        parts["target"][...] = offset[:, :, world.index["target"]]
+        parts["obstacle"][...] = offset[:, :, world.index["obstacle"]]
+        parts["agent"][...] = offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, n - 1, 2)
 
     def outcome(self, world: World) -> Outcome:
         """Return - sum over targets of the distance to the nearest agent - collisions, and the coverage."""

@@ -19,11 +19,17 @@ from ray.tune.registry import register_env
 
 from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
-from rllib_maobs.envs.team import Bool, Float, JointEnv, StepResult
+from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
+from rllib_maobs.layout import Entities, Layout, flat
 
 
 class WithAgentIds:
     """An environment whose observations begin with the agent's number as a one-hot vector.
+
+    Attributes:
+        id_layout: What stands in front of each observation: the group "agent_id".
+        observation_layouts: What each agent's observation is made of, `id_layout` included.
+        state_layout: What the environment's own state is made of, None if it does not say.
 
     Args:
         env: The environment.
@@ -39,6 +45,14 @@ class WithAgentIds:
             for agent, space in env.observation_spaces.items()
             if isinstance(space, gym.spaces.Box)
         }
+        self.id_layout: Layout = (Entities("agent_id", 1, len(env.agents)),)
+        layouts: dict[str, Groups] = {
+            agent: flat(flatdim(env.observation_spaces[agent]), "observation") for agent in self.observation_spaces
+        }
+        known: Mapping[str, Groups | None] = getattr(env, "observation_layouts", None) or {}
+        layouts.update({agent: layout for agent, layout in known.items() if layout is not None})
+        self.observation_layouts = {agent: (*self.id_layout, *layout) for agent, layout in layouts.items()}
+        self.state_layout: Groups | None = getattr(env, "state_layout", None)
         self._ids = np.broadcast_to(np.eye(len(env.agents), dtype=np.float32), (env.num_envs, *[len(env.agents)] * 2))
 
     def _with_ids(self, obs: Float) -> Float:
@@ -103,6 +117,10 @@ def make_joint_env(creator: Callable[[Any], Any], context: Any, num_envs: int) -
 class StackedEnv:
     """Copies of a dict-speaking multi-agent environment, stacked to arrays.
 
+    Attributes:
+        observation_layouts: What each agent's observation is made of, None if the environment does not say.
+        state_layout: What its `state()` is made of, None if it does not say.
+
     Args:
         envs: The copies: RLlib `MultiAgentEnv`s or PettingZoo `ParallelEnv`s.
 
@@ -130,6 +148,8 @@ class StackedEnv:
         self.observation_spaces = {a: space(a) for a, space in self.observation_spaces.items()}
         self.action_spaces = {a: space(a) for a, space in self.action_spaces.items()}
         self._size = max(flatdim(space) for space in self.observation_spaces.values())
+        self.observation_layouts: Mapping[str, Groups | None] | None = getattr(env, "observation_layouts", None)
+        self.state_layout: Groups | None = getattr(env, "state_layout", None)
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`."""

@@ -12,6 +12,7 @@ from rllib_maobs.envs.registry import make_scenario
 from rllib_maobs.envs.rendering import FRAMES_PER_SECOND, RENDER_MODES, Frame
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.envs.single import ByAgent, SingleCopy
+from rllib_maobs.layout import Entities, Layout, layout_size
 
 
 class MAObsParallelEnv(ParallelEnv):
@@ -19,6 +20,11 @@ class MAObsParallelEnv(ParallelEnv):
 
     All agents act in every step and end together; `agents` is then empty until the next reset. In the last
     step the info of every agent holds "episode_metrics", a dictionary of floats.
+
+    Attributes:
+        observation_layouts: What each agent's observation is made of, by id.
+        state_layout: What `state()` is made of: with the scenario's option `state="world"` `Scenario.state_layout`,
+            otherwise a group for each agent, its observation.
 
     Args:
         scenario: The task.
@@ -39,7 +45,11 @@ class MAObsParallelEnv(ParallelEnv):
         self._copy = SingleCopy(scenario, render_mode)
         self.possible_agents = list(scenario.agents)
         self.agents: list[str] = []
-        low_high = np.full(self._copy.env.state_size(), np.inf, np.float32)
+        env = self._copy.env
+        self.observation_layouts = env.observation_layouts
+        rows = tuple(Entities(agent, 1, layout_size(layout)) for agent, layout in env.observation_layouts.items())
+        self.state_layout: Layout = env.state_layout if scenario.options.state == "world" else rows
+        low_high = np.full(env.state_size(), np.inf, np.float32)
         self.state_space = gym.spaces.Box(-low_high, low_high, dtype=np.float32)
 
     def observation_space(self, agent: str) -> gym.Space[Any]:

@@ -9,11 +9,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from rllib_maobs.envs.coverage import Positive, others
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.placement import Placement
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
 from rllib_maobs.envs.steering import steer, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
+from rllib_maobs.layout import Entities, Layout, split
+from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
 
     **Action**: see `action_mode`; Box(-1, 1, (5,), float32) by default.
 
-    **State**: "observations", 48 numbers (62 with a learned prey), or "world", positions of all bodies (predators,
-    prey, obstacles) and velocities of predators and prey, 4(N + 1) + 2M = 20.
+    **State**: "observations", 48 numbers (62 with a learned prey), or "world", a row for each body:
+    position (2) and velocity (2) of predators and prey, then position (2) of obstacles, 4(N + 1) + 2M = 20.
 
     **Reward**: every predator gets r = 10 C - P - O - shaping * D, where C counts the predators that touch the prey
     after the step, P the pairs of predators in contact, O the contacts of predators with obstacles, and D is the
@@ -129,6 +130,10 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
             clearance=o.clearance,
             exclusive=[range(num_bodies)] if o.placement == "separated" else [],
         )
+        common = Entities("self", 1, 4), Entities("obstacle", m, 2, position=2)
+        prey = Entities("prey", 1, 4, position=2)
+        self._predator_layout: Layout = (*common, Entities("predator", n - 1, 2, position=2), prey)
+        self._prey_layout: Layout = (*common, Entities("predator", n, 2, position=2))
         self._others = others(n, num_bodies)
 
     def bodies(self) -> Sequence[Bodies]:
@@ -150,35 +155,32 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
         return self._placement.sample(rngs)
 
     @property
-    def observation_size(self) -> int:
-        """O of a predator."""
-        return 4 + 2 * self.options.num_obstacles + 2 * (self.options.num_predators - 1) + 4
+    def observation_layout(self) -> Layout:
+        """What a predator's observation is made of; a row of the prey is its offset and its velocity."""
+        return self._predator_layout
+
+    @property
+    def observation_layouts(self) -> Sequence[Layout]:
+        """What every agent's observation is made of."""
+        return ([self._predator_layout] * self.options.num_predators + [self._prey_layout])[: len(self.agents)]
 
     @property
     def shared_reward(self) -> bool:
         """Predators share theirs; a learned prey is paid for the opposite."""
         return self.options.prey != "learned"
 
-    @property
-    def observation_sizes(self) -> Sequence[int]:
-        """O of every agent."""
-        n = self.options.num_predators
-        return ([self.observation_size] * n + [self.observation_size - 2])[: len(self.agents)]
-
     def observe(self, world: World, out: NDArray[np.float32]) -> None:
-        """Write velocity, position, obstacles, other agents, and for predators the velocity of the prey."""
-        e, n, m = world.num_envs, self.options.num_predators, self.options.num_obstacles
-        agents = len(self.agents)
-        out[..., 0:2] = world.velocity[:, :agents]
-        out[..., 2:4] = world.position[:, :agents]
-        out[..., 4 : 4 + 2 * m] = world.offset[:, :agents, n + 1 :].reshape(e, agents, 2 * m)
-        rest = out[..., 4 + 2 * m :]
-        team = rest[:, :n]
-        team[..., : 2 * (n - 1)] = world.offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, -1)
-        team[..., -4:-2] = world.offset[:, :n, n]
-        team[..., -2:] = world.velocity[:, None, n]
+        """Write velocity and position, obstacles, other predators, and for predators the prey."""
+        e, n, agents, offset = world.num_envs, self.options.num_predators, len(self.agents), world.offset
+        parts = split(self._predator_layout, out)  # a learned prey's observation begins like a predator's
+        parts["self"][:, :, 0, 0:2] = world.velocity[:, :agents]
+        parts["self"][:, :, 0, 2:4] = world.position[:, :agents]
+        parts["obstacle"][...] = offset[:, :agents, world.index["obstacle"]]
+        parts["predator"][:, :n] = offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, n - 1, 2)
+        parts["prey"][:, :n, 0, 0:2] = offset[:, :n, n]
+        parts["prey"][:, :n, 0, 2:4] = world.velocity[:, None, n]
         if agents > n:
-            rest[:, n, : 2 * n] = world.offset[:, n, :n].reshape(e, -1)
+            split(self._prey_layout, out[:, n])["predator"][...] = offset[:, n, :n]
 
     def outcome(self, world: World) -> Outcome:
         """Return the rewards of the class docstring, and captures."""

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from rllib_maobs.envs.options import closest
 from rllib_maobs.envs.predator_prey import PredatorPrey
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.envs.simple_tunnel import SimpleTunnel
 from rllib_maobs.envs.spread import Spread
 from rllib_maobs.envs.tunnel import Tunnel
 from rllib_maobs.envs.vector import VectorEnv
+from rllib_maobs.options import closest
 
 SCENARIOS: dict[str, tuple[type[Scenario[Any]], dict[str, Any]]] = {
     "obstacle-predator-prey": (PredatorPrey, {}),

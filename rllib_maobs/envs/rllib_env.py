@@ -31,6 +31,10 @@ class MAObsEnv(MultiAgentEnv):
     )
     ```
 
+    Attributes:
+        observation_layouts: What each agent's observation is made of, by id.
+        state_layout: What `state("world")` is made of.
+
     Args:
         config: "scenario" (a registered id or a `Scenario` class), the scenario's options, and "render_mode":
             None, "rgb_array" (`render()` returns a picture (H, W, 3)) or "human" (a window shows every step).
@@ -51,6 +55,8 @@ class MAObsEnv(MultiAgentEnv):
         super().__init__()
         self.observation_spaces = self._copy.env.observation_spaces
         self.action_spaces = self._copy.env.action_spaces
+        self.observation_layouts = self._copy.env.observation_layouts
+        self.state_layout = self._copy.env.state_layout
 
     @override(MultiAgentEnv)
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByAgent, ByAgent]:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.options import Range, build_options
 from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World
+from rllib_maobs.layout import Entities, Layout, flat, layout_size, split
+from rllib_maobs.options import Range, build_options
 
 # Direction of each discrete action: idle, +x, -x, +y, -y.
 _DIRECTIONS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -29,7 +30,8 @@ class ScenarioOptions:
         integrator: "semi_implicit" (the original MPE), or "explicit" (as MPE2 has it, to compare).
         terminate_on_success: Whether an episode terminates as soon as the task is solved.
         state: What `state()` returns by default: "observations" (all agents' observations in a row) or
-            "world" (positions of all bodies, then velocities of those that move).
+            "world" (a row for each body: position and velocity of those that move, position of the others; see
+            `Scenario.state_layout`).
     """
 
     horizon: Annotated[int, Range(1)] = 100
@@ -65,6 +67,12 @@ class Scenario(ABC, Generic[OptionsT]):
     A scenario holds options, never episode state: it describes E copies at once, and all its arrays have E
     first.
 
+    What an agent observes is described by groups of entities, `Entities(name, count, size, position)`, in the order of
+    the numbers: `count` alike things with `size` numbers each, of which the first `position` are an offset from the
+    observer. The agent's own numbers come first, as the group "self"; others are called after what they are, in the
+    singular ("target", "obstacle", "agent"). Networks that treat alike things alike read this; an MLP needs only the
+    length. `split` cuts arrays into the groups, to write them by name.
+
     Example: meet at the origin without touching each other.
 
     ```python
@@ -73,7 +81,7 @@ class Scenario(ABC, Generic[OptionsT]):
     import numpy as np
 
     import rllib_maobs as maobs
-    from rllib_maobs.envs import Bodies, Outcome, ScenarioOptions
+    from rllib_maobs.envs import Bodies, Entities, Outcome, ScenarioOptions, split
 
 
     @dataclass(frozen=True)
@@ -93,12 +101,15 @@ class Scenario(ABC, Generic[OptionsT]):
             return np.stack([rng.uniform(-1, 1, (self.options.num_agents, 2)) for rng in rngs])
 
         @property
-        def observation_size(self):
-            return 4
+        def observation_layout(self):  # O = 4 + 2(N - 1) numbers
+            return Entities("self", 1, 4), Entities("agent", self.options.num_agents - 1, 2, position=2)
 
-        def observe(self, world, out):  # out: (E, N, 4)
-            out[..., 0:2] = world.velocity
-            out[..., 2:4] = world.position
+        def observe(self, world, out):  # out: (E, N, O)
+            n = self.options.num_agents
+            parts = split(self.observation_layout, out)  # views: (E, N, 1, 4) and (E, N, N - 1, 2)
+            parts["self"][..., 0, 0:2] = world.velocity
+            parts["self"][..., 0, 2:4] = world.position
+            parts["agent"][...] = world.offset[:, ~np.eye(n, dtype=bool)].reshape(-1, n, n - 1, 2)
 
         def outcome(self, world):
             distance = np.linalg.norm(world.position, axis=-1)  # (E, N)
@@ -147,6 +158,8 @@ class Scenario(ABC, Generic[OptionsT]):
 
     def __init__(self, **options: Any) -> None:
         owner = type(self).__name__
+        if not self._overrides("observation_layout") and not self._overrides("observation_size"):
+            raise TypeError(f"{owner} does not say what its agents observe: override Scenario.observation_layout")
         self.options: OptionsT = build_options(self.options_class, options, owner)  # type: ignore[assignment]
         acting = self.agent_groups()
         self.agents = [f"{g.name}_{i}" for g in self.bodies() if g.name in acting for i in range(g.count)]
@@ -181,9 +194,29 @@ class Scenario(ABC, Generic[OptionsT]):
         """
 
     @property
-    @abstractmethod
+    def observation_layout(self) -> Layout:
+        """What one agent's observation is made of; that of the longest one where they differ.
+
+        Override this. A scenario that overrides `observation_size` instead has one group without a meaning.
+        """
+        return flat(self.observation_size, "observation")
+
+    @property
+    def observation_layouts(self) -> Sequence[Layout]:
+        """What each agent's observation is made of, by default the same for all; override it where they differ."""
+        if self._overrides("observation_sizes"):
+            return [flat(size, "observation") for size in self.observation_sizes]
+        return [self.observation_layout] * len(self.agents)
+
+    @property
     def observation_size(self) -> int:
         """O, the length of one agent's observation; of the longest one where they differ."""
+        return layout_size(self.observation_layout)
+
+    @property
+    def observation_sizes(self) -> Sequence[int]:
+        """Length of each agent's observation; shorter ones are padded with zeros to O in arrays (E, N, O)."""
+        return [layout_size(layout) for layout in self.observation_layouts]
 
     @property
     def shared_reward(self) -> bool | None:
@@ -194,18 +227,14 @@ class Scenario(ABC, Generic[OptionsT]):
         mode = getattr(self.options, "reward_mode", None)
         return None if mode is None else mode != "individual"
 
-    @property
-    def observation_sizes(self) -> Sequence[int]:
-        """Length of each agent's observation; shorter ones are padded with zeros to O in arrays (E, N, O)."""
-        return [self.observation_size] * len(self.agents)
-
     @abstractmethod
     def observe(self, world: World, out: NDArray[np.float32]) -> None:
         """Write the observations of all agents.
 
         Args:
             world: The copies.
-            out: (E, N, O), to be filled with each agent's `observation_sizes` numbers; the rest is padding.
+            out: (E, N, O), to be filled with each agent's numbers, by `observation_layouts`; the rest is padding.
+                `split` gives the groups as arrays (E, N, count, size) to write to.
         """
 
     @abstractmethod
@@ -240,14 +269,31 @@ class Scenario(ABC, Generic[OptionsT]):
         """Return the walls of the arena; none by default."""
         return ()
 
+    @property
+    def state_layout(self) -> Layout:
+        """What the world state is made of: the groups of `bodies`, in their order, a row for each body.
+
+        The rows of bodies that move are position (2) and velocity (2), those of the others position (2). So the first
+        groups are the agents, one row each in the order of `agents`. A scenario that knows more about its world adds
+        groups behind these, here and in `world_state`.
+        """
+        return tuple(Entities(group.name, group.count, 4 if group.movable else 2, 2) for group in self.bodies())
+
     def world_state_size(self) -> int:
         """S of the world state."""
-        return 2 * sum(group.count * (1 + group.movable) for group in self.bodies())
+        return layout_size(self.state_layout)
 
     def world_state(self, world: World) -> NDArray[np.float32]:
-        """Return the (E, S) world state: positions of all bodies, then velocities of those that move."""
-        parts = world.position, world.velocity[:, : world.num_movers]
-        return np.concatenate([part.reshape(world.num_envs, -1) for part in parts], axis=1, dtype=np.float32)
+        """Return the (E, S) world state, see `state_layout`."""
+        layout = self.state_layout
+        state = np.zeros((world.num_envs, layout_size(layout)), np.float32)
+        parts = split(layout, state)
+        for group in world.groups:
+            rows, bodies = parts[group.name], world.index[group.name]
+            rows[..., 0:2] = world.position[:, bodies]
+            if group.movable:
+                rows[..., 2:4] = world.velocity[:, bodies]
+        return state
 
     def make_world(self, num_envs: int) -> World:
         """Return the physics of E copies."""
@@ -304,3 +350,6 @@ class Scenario(ABC, Generic[OptionsT]):
             rngs: One generator per copy.
         """
         return np.zeros((world.num_envs, world.num_movers - len(self.agents), 2))
+
+    def _overrides(self, name: str) -> bool:
+        return getattr(type(self), name) is not getattr(Scenario, name)

@@ -9,12 +9,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from rllib_maobs.envs.coverage import TARGET_RADIUS, Positive, others, share_rewards
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.scenario import Outcome, Scenario
 from rllib_maobs.envs.steering import take_turns, thrust
 from rllib_maobs.envs.tunnel import TunnelOptions, check_gap, column, gap_obstacles
 from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World
+from rllib_maobs.layout import Entities, Layout, split
+from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class SimpleTunnel(Scenario[SimpleTunnelOptions]):
 
     **Action**: see `action_mode`; Box(-1, 1, (5,), float32) by default.
 
-    **State**: "observations", N * O numbers (42, 120), or "world", positions of all bodies (agents, obstacles,
-    targets) and velocities of the agents, 2(3N + 2) (22, 40).
+    **State**: "observations", N * O numbers (42, 120), or "world", a row for each body: position (2) and
+    velocity (2) of the agents, then position (2) of obstacles and targets, 2(3N + 2) (22, 40).
 
     **Reward**: r_i = - distance of agent i to its target - A_i - O_i - W_i, where A_i, O_i and W_i count the
     agents, obstacles and walls that touch agent i after the step.
@@ -118,6 +119,12 @@ class SimpleTunnel(Scenario[SimpleTunnelOptions]):
         )
         self._check_walls(names[:n], starts, o.agent_radius + o.start_noise)
         self._check_walls(names[n + 2 :], targets, o.agent_radius)
+        self._observation_layout = (
+            Entities("self", 1, 4),
+            Entities("target", 1, 2, position=2),
+            Entities("obstacle", 2, 2, position=2),
+            Entities("agent", n - 1, 2, position=2),
+        )
         self._others = others(n, len(names))
 
     def bodies(self) -> Sequence[Bodies]:
@@ -151,18 +158,19 @@ class SimpleTunnel(Scenario[SimpleTunnelOptions]):
         return self._layout.sample(rngs)
 
     @property
-    def observation_size(self) -> int:
-        """O."""
-        return 4 + 2 + 4 + 2 * (self.options.num_agents - 1)
+    def observation_layout(self) -> Layout:
+        """Own velocity and position, then offsets of the own target, obstacles, other agents."""
+        return self._observation_layout
 
     def observe(self, world: World, out: NDArray[np.float32]) -> None:
-        """Write velocity, position, own target, obstacles, other agents."""
-        e, n = world.num_envs, self.options.num_agents
-        out[..., 0:2] = world.velocity[:, :n]
-        out[..., 2:4] = world.position[:, :n]
-        out[..., 4:6] = self._own_target(world)
-        out[..., 6:10] = world.offset[:, :, world.index["obstacle"]].reshape(e, n, 4)
-        out[..., 10:] = world.offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, -1)
+        """Write velocity and position, own target, obstacles, other agents."""
+        e, n, offset = world.num_envs, self.options.num_agents, world.offset
+        parts = split(self._observation_layout, out)
+        parts["self"][:, :, 0, 0:2] = world.velocity[:, :n]
+        parts["self"][:, :, 0, 2:4] = world.position[:, :n]
+        parts["target"][:, :, 0] = self._own_target(world)
+        parts["obstacle"][...] = offset[:, :, world.index["obstacle"]]
+        parts["agent"][...] = offset.reshape(e, -1, 2).take(self._others, axis=1).reshape(e, n, n - 1, 2)
 
     def outcome(self, world: World) -> Outcome:
         """Return the reward of the class docstring and who is at the own target."""

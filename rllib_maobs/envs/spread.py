@@ -8,10 +8,10 @@ import numpy as np
 from numpy.random import Generator
 
 from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.placement import Placement
 from rllib_maobs.envs.steering import assign, steer, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
+from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Spread(Coverage[SpreadOptions]):
 
     **Action**: see `action_mode`; Box(-1, 1, (5,), float32) by default.
 
-    **State**: "observations", N * O numbers (54, 204, 450), or "world", positions of all bodies (agents,
-    obstacles, targets) and velocities of the agents, 2(3N + M) (22, 44, 66).
+    **State**: "observations", N * O numbers (54, 204, 450), or "world", a row for each body: position
+    (2) and velocity (2) of the agents, then position (2) of obstacles and targets, 2(3N + M) (22, 44, 66).
 
     **Reward**: r_i = - sum over targets of the distance to the nearest agent - A_i - O_i, where A_i and O_i
     count the agents and obstacles that touch agent i after the step. With `reward_mode="sum"` every agent
@@ -51,10 +51,10 @@ class Spread(Coverage[SpreadOptions]):
     targets of the distance to the nearest agent). Success means that all targets are covered.
 
     **Reference returns** of one agent, mean over 200 episodes (seeds 0 to 199) of `spread-3a` / `spread-6a` /
-    `spread-9a`: uniformly random actions -802 / -2197 / -4052. The heuristic (a potential field and an assignment of
-    agents to targets) -34 / -82 / -137; it covers all targets in 99 / 96 / 96 % of the episodes, and 98 / 78 / 50 %
-    are without any contact. It sees only what is near: where two obstacles, or an agent that has arrived, close the
-    straight way, it may stay in the pocket between them.
+    `spread-9a`: uniformly random actions -802 / -2197 / -4052. The heuristic (a potential field and the best
+    assignment of agents to targets) -35 / -79 / -138; it covers all targets in 99 / 97 / 96 % of the episodes, and 98 /
+    79 / 51 % are without any contact. It sees only what is near: where two obstacles, or an agent that has arrived,
+    close the straight way, it may stay in the pocket between them.
 
     Args:
         num_agents: N agents and as many targets. [paper: 3, 6, 9]

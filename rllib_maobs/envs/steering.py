@@ -7,6 +7,7 @@ function of the present situation of E copies; nothing is remembered.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from rllib_maobs.envs.world import FloatArray, World
 
@@ -16,9 +17,7 @@ _PASSES = 8  # a step aside from one body may lead towards the next
 
 
 def assign(distance: FloatArray) -> NDArray[np.intp]:
-    """Match agents and targets one to one, with a small sum of squared distances.
-
-    The nearest pairs are matched first; then pairs of agents exchange their targets as long as that helps.
+    """Match agents and targets one to one, with the smallest sum of squared distances.
 
     Args:
         distance: (E, N, N), of each agent to each target.
@@ -26,25 +25,7 @@ def assign(distance: FloatArray) -> NDArray[np.intp]:
     Returns:
         (E, N) number of each agent's target.
     """
-    e, n, _ = distance.shape
-    copies, cost = np.arange(e), distance**2
-    free, goal = cost.copy(), np.zeros((e, n), np.intp)
-    for _ in range(n):
-        agent, target = np.divmod(free.reshape(e, -1).argmin(axis=1), n)
-        goal[copies, agent] = target
-        free[copies, agent] = free[copies, :, target] = np.inf
-    for _ in range(n * n):
-        # crossed[e, i, j]: what agent i pays for the target of agent j.
-        crossed = np.take_along_axis(cost, np.broadcast_to(goal[:, None], (e, n, n)), axis=2)
-        own = np.take_along_axis(cost, goal[..., None], axis=2)
-        gain = own + own.transpose(0, 2, 1) - crossed - crossed.transpose(0, 2, 1)
-        agent, other = np.divmod(gain.reshape(e, -1).argmax(axis=1), n)
-        better = np.flatnonzero(gain[copies, agent, other] > 1e-9)
-        if not better.size:
-            break
-        a, b = agent[better], other[better]
-        goal[better, a], goal[better, b] = goal[better, b], goal[better, a]
-    return goal
+    return np.array([linear_sum_assignment(cost)[1] for cost in distance**2], np.intp)
 
 
 def steer(world: World, aim: FloatArray, speed: float = 1.0, ignore: str | None = None) -> FloatArray:

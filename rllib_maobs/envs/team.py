@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,15 +11,22 @@ import numpy as np
 from gymnasium.spaces import flatdim
 from numpy.typing import NDArray
 
+from rllib_maobs.layout import Layout, as_layout, flat, layout_size
+
 Float = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 StepResult = tuple[Float, Float, Bool, Bool, dict[str, Any]]
+Groups = Iterable[Iterable[Any]]  # what `as_layout` makes a layout of
 # Of rewards that are called equal, relative to their size: sums taken in another order differ.
 REWARD_TOLERANCE = 1e-5
 
 
 class JointEnv(Protocol):
-    """E copies of one environment with a fixed team of N agents, stepped together; `VectorEnv` is one."""
+    """E copies of one environment with a fixed team of N agents, stepped together; `VectorEnv` is one.
+
+    It may say more: `observation_layouts` (by agent) and `state_layout`, what observations and the state are made of,
+    and `shared_reward`, whether all agents always get the same reward.
+    """
 
     num_envs: int
     agents: list[str]
@@ -53,13 +60,21 @@ class Team:
         agents: Agent ids in the environment's order: the order of every N axis.
         observation_spaces: Every agent's observation space.
         action_spaces: Every agent's action space: all bounded vectors, or all Discrete.
-        state_size: S of `state("world")`, 0 if it was not asked for.
+        observation_layouts: What every agent's observation is made of; one group "observation" where that is unknown.
+        state_layout: What `state("world")` is made of; one group "state" if that is unknown, None if it was not asked
+            for.
     """
 
     agents: tuple[str, ...]
     observation_spaces: tuple[gym.spaces.Box, ...]
     action_spaces: tuple[gym.spaces.Box, ...] | tuple[gym.spaces.Discrete, ...]
-    state_size: int
+    observation_layouts: tuple[Layout, ...]
+    state_layout: Layout | None
+
+    @property
+    def state_size(self) -> int:
+        """S of `state("world")`, 0 if it was not asked for."""
+        return 0 if self.state_layout is None else layout_size(self.state_layout)
 
     @property
     def observation_sizes(self) -> tuple[int, ...]:
@@ -100,15 +115,26 @@ class Team:
         return self.observation_spaces[index], self.action_spaces[index]
 
     @classmethod
-    def of(cls, env: JointEnv, *, with_state: bool) -> Team:
+    def of(
+        cls,
+        env: JointEnv,
+        *,
+        with_state: bool,
+        observation_layouts: Mapping[str, Groups] | None = None,
+        state_layout: Groups | None = None,
+    ) -> Team:
         """Inspects an environment.
 
         Args:
             env: The environment.
             with_state: Whether its own state is needed (`critic_state="world"`); then it is reset once.
+            observation_layouts: What observations of some or all agents are made of, by id, instead of what the
+                environment says; without agent ids, which are not the environment's own.
+            state_layout: What the state is made of, instead of what the environment says.
 
         Raises:
-            ValueError: If spaces are not vectors, or actions unbounded or of both kinds; says which and what is legal.
+            ValueError: If spaces are not vectors, or actions unbounded or of both kinds, or a layout is not legal, does
+                not add up or belongs to no agent; says which and what is legal.
         """
         agents = tuple(env.agents)
         for agent in agents:
@@ -135,11 +161,33 @@ class Team:
                     f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs "
                     f"finite bounds to scale to."
                 )
-        state_size = 0
-        if with_state:
-            env.reset()
-            state_size = int(env.state("world").shape[-1])
-        return cls(agents, tuple(env.observation_spaces[agent] for agent in agents), actions, state_size)
+        observations = tuple(env.observation_spaces[agent] for agent in agents)
+        layouts: dict[str, Groups | None] = dict(getattr(env, "observation_layouts", None) or {})
+        ids: Layout = getattr(env, "id_layout", ())
+        layouts.update({agent: (*ids, *own) for agent, own in (observation_layouts or {}).items()})
+        if unknown := [agent for agent in layouts if agent not in agents]:
+            raise ValueError(f"There are observation layouts of {unknown}; legal are those of the agents {[*agents]}.")
+        return cls(
+            agents,
+            observations,
+            actions,
+            tuple(
+                _layout(layouts.get(agent), "observation", int(space.shape[0]), f" of agent {agent!r}")
+                for agent, space in zip(agents, observations, strict=True)
+            ),
+            _state_layout(env, state_layout) if with_state else None,
+        )
+
+
+def _state_layout(env: JointEnv, given: Groups | None) -> Layout:
+    """Resets the environment, and returns what its own state is made of: as given, or else as it says."""
+    env.reset()
+    size = int(env.state("world").shape[-1])
+    return _layout(getattr(env, "state_layout", None) if given is None else given, "state", size)
+
+
+def _layout(groups: Groups | None, what: str, size: int, owner: str = "") -> Layout:
+    return flat(size, what) if groups is None else as_layout(groups, size, f"{what}{owner}")
 
 
 def shares_reward(env: JointEnv, steps: int = 25) -> bool:

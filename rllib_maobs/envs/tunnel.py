@@ -8,10 +8,10 @@ import numpy as np
 from numpy.random import Generator
 
 from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive
-from rllib_maobs.envs.options import Range
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.steering import assign, take_turns, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
+from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Tunnel(Coverage[TunnelOptions]):
 
     **Action**: see `action_mode`; Box(-1, 1, (5,), float32) by default.
 
-    **State**: "observations", N * O = 54 numbers, or "world", positions of all bodies (agents, obstacles, targets)
-    and velocities of the agents, 2(3N + 2) = 22.
+    **State**: "observations", N * O = 54 numbers, or "world", a row for each body: position (2) and velocity (2) of
+    the agents, then position (2) of obstacles and targets, 2(3N + 2) = 22.
 
     **Reward**: r_i = - sum over targets of the distance to the nearest agent - A_i - O_i, where A_i and O_i count
     the agents and obstacles that touch agent i after the step. With `reward_mode="sum"` every agent gets sum_i r_i.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rllib_maobs.envs.metrics import EpisodeTracker
 from rllib_maobs.envs.scenario import Scenario
+from rllib_maobs.layout import Layout, as_layout
 
 Info = dict[str, Any]
 
@@ -42,6 +43,8 @@ class VectorEnv:
         horizon: Steps until an episode is truncated.
         observation_spaces: Space of each agent, by id.
         action_spaces: Space of each agent, by id.
+        observation_layouts: What each agent's observation is made of, by id.
+        state_layout: What `state("world")` is made of.
         world: The physics; `world.position` and `world.velocity` (E, K, 2) may be written at any time.
         seeds: (E,) seed that each copy's generator started from.
 
@@ -57,10 +60,21 @@ class VectorEnv:
         self.num_envs = int(num_envs)
         self.agents = list(scenario.agents)
         self.horizon: int = scenario.options.horizon
-        n, sizes = len(self.agents), list(scenario.observation_sizes)
+        layouts, sizes = scenario.observation_layouts, list(scenario.observation_sizes)
+        self.observation_layouts: dict[str, Layout] = {
+            agent: as_layout(layout, size, f"observation of agent {agent!r}")
+            for agent, layout, size in zip(self.agents, layouts, sizes, strict=True)
+        }
+        self.state_layout = as_layout(scenario.state_layout, scenario.world_state_size(), "world state")
+        n, self._observation_size = len(self.agents), scenario.observation_size
+        if self._observation_size != max(sizes):
+            raise ValueError(
+                f"{scenario} has observation_size {self._observation_size}, but its agents' observation_layouts have "
+                f"{sizes} numbers: override Scenario.observation_layout, of the longest one where they differ"
+            )
         spaces = {a: gym.spaces.Box(-np.inf, np.inf, (o,), np.float32) for a, o in zip(self.agents, sizes, strict=True)}
         # (N, O), where an observation ends and its padding begins; None where no agent has any.
-        padding = np.arange(scenario.observation_size) >= np.array(sizes)[:, None]
+        padding = np.arange(self._observation_size) >= np.array(sizes)[:, None]
         self._padding: NDArray[np.bool_] | None = padding if padding.any() else None
         self.observation_spaces: dict[str, gym.Space[Any]] = dict(spaces)
         self.shared_reward = scenario.shared_reward
@@ -151,7 +165,7 @@ class VectorEnv:
         `observation_spaces` tells the true lengths.
         """
         self.world.refresh()
-        out = np.empty((self.num_envs, len(self.agents), self.scenario.observation_size), np.float32)
+        out = np.empty((self.num_envs, len(self.agents), self._observation_size), np.float32)
         self.scenario.observe(self.world, out)
         if self._padding is not None:
             out[:, self._padding] = 0.0
@@ -175,8 +189,8 @@ class VectorEnv:
         """Return the (E, S) global state of the current situation.
 
         Args:
-            kind: "observations" (all agents' observations in a row, without padding) or "world" (positions of all
-                bodies, then velocities of those that move); None for the scenario's option `state`.
+            kind: "observations" (all agents' observations in a row, without padding) or "world" (a row for each
+                body, see `Scenario.state_layout`); None for the scenario's option `state`.
 
         Raises:
             RuntimeError: If the environment was never reset.

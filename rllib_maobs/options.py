@@ -1,4 +1,4 @@
-"""Keyword options of scenarios: frozen dataclasses whose type hints are the legal values."""
+"""Settings whose type hints are their legal values: options of scenarios, of networks and of algorithms."""
 
 import dataclasses
 import difflib
@@ -61,11 +61,22 @@ def build_options(cls: type[T], values: dict[str, Any], owner: str) -> T:
     for name in values:
         if name not in legal:
             raise ValueError(f"{owner} has no option {name!r}{closest(name, legal)}; legal options: {', '.join(legal)}")
-    return cls(**{name: _check(value, hints[name], name, owner) for name, value in values.items()})
+    return cls(**{name: check_value(value, hints[name], name, owner) for name, value in values.items()})
 
 
-def _check(value: Any, hint: Any, name: str, owner: str) -> Any:
-    """Return the value converted to its hint, or raise a ValueError that says what is legal."""
+def check_value(value: Any, hint: Any, name: str, owner: str) -> Any:
+    """Return the value converted to its hint.
+
+    Args:
+        value: What was given.
+        hint: `int`, `float`, `bool`, `str`, `Literal[...]`, `X | None`, or a number in a range as `Annotated[int,
+            Range(1)]`. Any other hint takes everything.
+        name: Of the setting, for the message.
+        owner: What the setting belongs to, for the message.
+
+    Raises:
+        ValueError: If the value is not legal; says what is.
+    """
     for alternative in _alternatives(hint):
         accepted, converted = _accept(value, alternative)
         if accepted:
@@ -97,7 +108,7 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
     if hint is float:
         finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
         return finite, float(value) if finite else value
-    return isinstance(value, hint), value
+    return not isinstance(hint, type) or isinstance(value, hint), value
 
 
 def _describe(hint: Any) -> str:
@@ -106,4 +117,14 @@ def _describe(hint: Any) -> str:
         return f"{_describe(inner)} {limits}"
     if get_origin(hint) is Literal:
         return ", ".join(repr(value) for value in get_args(hint))
-    return {int: "an integer", float: "a number", bool: "True or False", type(None): "None"}.get(hint, str(hint))
+    return _WORDS.get(hint, str(hint))
+
+
+_WORDS = {
+    int: "an integer",
+    float: "a number",
+    bool: "True or False",
+    str: "a string",
+    list: "a list",
+    type(None): "None",
+}
