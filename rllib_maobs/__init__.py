@@ -1,7 +1,5 @@
 """Centralised-critic, deterministic-policy multi-agent RL on RLlib's new API stack."""
 
-from ray.tune.registry import register_trainable
-
 from rllib_maobs.algorithms import (
     ALGORITHMS,
     FACMAC,
@@ -21,8 +19,11 @@ from rllib_maobs.algorithms import (
     MADDPGLConfig,
     MADDPGLSTMConfig,
     QMIXConfig,
+    Supports,
     VDNConfig,
+    register_algorithm,
 )
+from rllib_maobs.algorithms.registry import register_algorithms
 from rllib_maobs.envs import (
     SCENARIOS,
     EpisodeMetricsCallback,
@@ -39,9 +40,26 @@ from rllib_maobs.envs import (
     register_scenario,
 )
 from rllib_maobs.envs.joint import register_envs
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import AgentModule, Critic, LSTMActor, Mixer, MLPActor, UtilityModule
-from rllib_maobs.replay import JointReplayBuffer
+from rllib_maobs.layout import Entities, Layout
+from rllib_maobs.learner import JointLearner, TeamNetworks
+from rllib_maobs.modules import (
+    ACTORS,
+    CRITICS,
+    EXPLORATIONS,
+    Actor,
+    AgentModule,
+    Critic,
+    EpsilonGaussian,
+    Exploration,
+    LSTMActor,
+    Mixer,
+    MLPActor,
+    MLPCritic,
+    OrnsteinUhlenbeck,
+    RecurrentActor,
+    UtilityModule,
+)
+from rllib_maobs.replay import Batch, JointReplayBuffer, Moment
 from rllib_maobs.runner import JointEnvRunner
 
 __version__ = "0.1.0"
@@ -53,12 +71,14 @@ def register() -> None:
     Ray forgets names when it is shut down, so this may be called again, as often as you like.
     """
     register_envs()
-    for algorithm in (IDDPG, MADDPG, MADDPGLSTM, MADDPGL, FACMAC, IQL, VDN, QMIX):
-        register_trainable(algorithm.__name__, algorithm)
+    register_algorithms()
 
 
 __all__ = [
+    "ACTORS",
     "ALGORITHMS",
+    "CRITICS",
+    "EXPLORATIONS",
     "FACMAC",
     "IDDPG",
     "IQL",
@@ -68,9 +88,14 @@ __all__ = [
     "QMIX",
     "SCENARIOS",
     "VDN",
+    "Actor",
     "AgentModule",
+    "Batch",
     "Critic",
+    "Entities",
     "EpisodeMetricsCallback",
+    "EpsilonGaussian",
+    "Exploration",
     "FACMACConfig",
     "IDDPGConfig",
     "IQLConfig",
@@ -80,18 +105,25 @@ __all__ = [
     "JointLearner",
     "JointReplayBuffer",
     "LSTMActor",
+    "Layout",
     "MADDPGConfig",
     "MADDPGLConfig",
     "MADDPGLSTMConfig",
     "MAObsEnv",
     "MLPActor",
+    "MLPCritic",
     "Mixer",
+    "Moment",
+    "OrnsteinUhlenbeck",
     "PredatorPrey",
     "QMIXConfig",
     "Recorder",
+    "RecurrentActor",
     "Scenario",
     "SimpleTunnel",
     "Spread",
+    "Supports",
+    "TeamNetworks",
     "Tunnel",
     "UtilityModule",
     "VDNConfig",
@@ -99,5 +131,6 @@ __all__ = [
     "make_vec",
     "parallel_env",
     "register",
+    "register_algorithm",
     "register_scenario",
 ]

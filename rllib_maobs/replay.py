@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,65 @@ from ray.rllib.utils.checkpoints import Checkpointable
 from torch import Tensor
 
 _NONE = -1  # "no such row" in the links between rows
+
+
+class Moment(NamedTuple):
+    """What there was at one time, in every row of a minibatch.
+
+    Attributes:
+        obs: `(B, N, O)`.
+        state: `(B, S)`; None where none is stored.
+        window: The last T observations up to `obs`, oldest first, `(B, N, T, O)`; None without windows.
+        mask: 1.0 where one of them counts, 0.0 before the episode's first observation, `(B, T)`.
+        recurrent_state: The actors' states from which these windows started when they acted, `(B, N, *H)`: constants,
+            whatever weights made them (Kapturowski et al. 2019's stored state). None if they are not stored.
+        name: "now" or "next".
+    """
+
+    obs: Tensor
+    state: Tensor | None = None
+    window: Tensor | None = None
+    mask: Tensor | None = None
+    recurrent_state: Tensor | None = None
+    name: str = "now"
+
+
+class Batch(NamedTuple):
+    """A minibatch of joint transitions, from replay to the losses.
+
+    Attributes:
+        now: When the agents acted.
+        next: n steps later.
+        actions: `(B, N, A)` in [-1, 1], or one-hot.
+        rewards: Discounted, of the n steps, `(B, N)`.
+        discount: Of the value after them, `(B, 1)`: gamma^n, or 0.0 where the episode really ended; a time limit
+            bootstraps.
+        noise: Random numbers of the losses `(B, N, A)`, which the learner adds: normal for smoothed target actions,
+            uniform for discrete actors.
+    """
+
+    now: Moment
+    next: Moment
+    actions: Tensor
+    rewards: Tensor
+    discount: Tensor
+    noise: Tensor | None = None
+
+    def unbind(self) -> list[Batch]:
+        """The minibatches of a batch whose tensors have a further dimension in front."""
+        batches: list[Batch] = _unbound(self)
+        return batches
+
+
+def _unbound(part: Any) -> Any:
+    """A list over the first dimension of a tensor, or of all tensors of a named tuple; anything else as it is."""
+    if isinstance(part, Tensor):
+        return list(part.unbind())
+    if not isinstance(part, tuple):
+        return part
+    columns = [_unbound(column) for column in part]
+    count = next(len(column) for column in columns if isinstance(column, list))
+    return [type(part)(*(c[i] if isinstance(c, list) else c for c in columns)) for i in range(count)]
 
 
 class JointReplayBuffer(Checkpointable):
@@ -32,9 +91,8 @@ class JointReplayBuffer(Checkpointable):
         observation_size: O.
         action_size: A.
         state_size: S, length of the stored state; 0 stores none.
-        hidden_size: H, length of the h and c of every agent's LSTM with which its window began when it acted; 0
-            stores none. They take 2 H floats for each agent in every row: 2.3 GB for 500 000 rows of nine agents
-            with H = 64.
+        recurrent_state: Shape `(*H)` of the recurrent state with which every agent's window began when it acted; None
+            stores none. An LSTM's is (2, H): 2.3 GB for 500 000 rows of nine agents with H = 64.
         seed: Seed of the sampling.
         device: Where the rows live and are sampled to.
     """
@@ -46,7 +104,7 @@ class JointReplayBuffer(Checkpointable):
         observation_size: int,
         action_size: int,
         state_size: int = 0,
-        hidden_size: int = 0,
+        recurrent_state: Sequence[int] | None = None,
         *,
         seed: int | None = None,
         device: torch.device | str = "cpu",
@@ -58,7 +116,7 @@ class JointReplayBuffer(Checkpointable):
             "observation_size": observation_size,
             "action_size": action_size,
             "state_size": state_size,
-            "hidden_size": hidden_size,
+            "recurrent_state": None if recurrent_state is None else tuple(recurrent_state),
         }
         shapes: dict[str, tuple[int, ...]] = {
             "obs": (num_agents, observation_size),
@@ -68,8 +126,8 @@ class JointReplayBuffer(Checkpointable):
         }
         if state_size:
             shapes["state"] = (state_size,)
-        if hidden_size:
-            shapes["hidden"] = (num_agents, 2, hidden_size)
+        if recurrent_state is not None:
+            shapes["recurrent_state"] = (num_agents, *recurrent_state)
         # Empty memory is not touched, so it costs nothing until rows are written to it.
         self._columns = {name: torch.empty((capacity, *shape), device=device) for name, shape in shapes.items()}
         # Rows are numbered for ever; row i lies at i % capacity and is there while i >= head - capacity.
@@ -100,8 +158,8 @@ class JointReplayBuffer(Checkpointable):
         final_obs: NDArray[np.float32],
         state: NDArray[np.float32] | None = None,
         final_state: NDArray[np.float32] | None = None,
-        hidden: NDArray[np.float32] | None = None,
-        final_hidden: NDArray[np.float32] | None = None,
+        recurrent_state: NDArray[np.float32] | None = None,
+        final_recurrent_state: NDArray[np.float32] | None = None,
         source: str = "",
         start: int = 0,
     ) -> None:
@@ -117,8 +175,8 @@ class JointReplayBuffer(Checkpointable):
                 (step first, then copy), `(D, N, O)`.
             state: States before each step, `(L, E, S)`, if states are stored.
             final_state: States at the episodes' ends, `(D, S)`, if states are stored.
-            hidden: h and c before each step's window, `(L, E, N, 2, H)`, if they are stored.
-            final_hidden: h and c after the episodes' last steps, `(D, N, 2, H)`, if they are stored.
+            recurrent_state: Recurrent states before each step's window, `(L, E, N, *H)`, if they are stored.
+            final_recurrent_state: Those after the episodes' last steps, `(D, N, *H)`, if they are stored.
             source: Who sampled the steps. Steps of one source that follow one another are linked.
             start: Number of the first step among the source's. A gap to what was added before (a lost or
                 restarted runner) breaks the link instead of joining two episodes.
@@ -157,9 +215,9 @@ class JointReplayBuffer(Checkpointable):
         if "state" in self._columns:
             self._write(row.reshape(-1), state=state)
             self._write(last, state=final_state)
-        if "hidden" in self._columns:
-            self._write(row.reshape(-1), hidden=hidden)
-            self._write(last, hidden=final_hidden)
+        if "recurrent_state" in self._columns:
+            self._write(row.reshape(-1), recurrent_state=recurrent_state)
+            self._write(last, recurrent_state=final_recurrent_state)
         self._head += steps + last.size
 
     def _write(self, rows: NDArray[np.int64], **columns: NDArray[Any] | None) -> None:
@@ -177,7 +235,7 @@ class JointReplayBuffer(Checkpointable):
             column[first : first + split] = flat[:split]
             column[: rows.size - split] = flat[split:]
 
-    def sample(self, shape: Sequence[int], *, gamma: float, n_step: int = 1, seq_length: int = 0) -> dict[str, Tensor]:
+    def sample(self, shape: Sequence[int], *, gamma: float, n_step: int = 1, seq_length: int = 0) -> Batch:
         """Draws transitions uniformly, with replacement.
 
         A transition of n steps ends earlier where its episode does, or where nothing later is stored.
@@ -189,12 +247,7 @@ class JointReplayBuffer(Checkpointable):
             seq_length: T, observations of a window up to each of both; 0 for no windows.
 
         Returns:
-            `obs` and `next_obs` `(*shape, N, O)`, `actions` `(*shape, N, A)`, the discounted `rewards` of the
-            steps `(*shape, N)`, the `discount` of the value after them `(*shape, 1)`: gamma^n, or 0.0 where
-            the episode terminated, and, if stored, `state` and `next_state` `(*shape, S)`. Windows are
-            `window` and `next_window` `(*shape, T, N, O)`, oldest first, in the place of `obs` and `next_obs`,
-            with `mask` and `next_mask` `(*shape, T)`: 0.0 before the episode's first observation. If stored, `hidden`
-            and `next_hidden` `(*shape, N, 2, H)` are the h and c that these windows started from in acting.
+            The transitions; all their tensors have `shape` in the place of B.
 
         Raises:
             ValueError: If no complete transition is stored yet.
@@ -214,23 +267,29 @@ class JointReplayBuffer(Checkpointable):
         following = self._next[last] % self.capacity
         ended = self._columns["terminated"].index_select(0, self._places(last))
         discount = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None] * (1.0 - ended)
-        batch = {
-            "actions": self._take("actions", rows, shape),
-            "rewards": total.view(*shape, -1),
-            "discount": discount.view(*shape, 1),
-        }
-        for prefix, places in (("", rows), ("next_", following)):
-            if seq_length:
-                window, mask, _ = self._windows(places, seq_length)
-                batch[f"{prefix}window"] = self._take("obs", window, (*shape, seq_length))
-                batch[f"{prefix}mask"] = torch.from_numpy(mask).to(rewards.device).view(*shape, seq_length)
-            else:
-                batch[f"{prefix}obs"] = self._take("obs", places, shape)
-            if "state" in self._columns:
-                batch[f"{prefix}state"] = self._take("state", places, shape)
-            if "hidden" in self._columns:
-                batch[f"{prefix}hidden"] = self._take("hidden", places, shape)
-        return batch
+        return Batch(
+            now=self._moment("now", rows, shape, seq_length),
+            next=self._moment("next", following, shape, seq_length),
+            actions=self._take("actions", rows, shape),
+            rewards=total.view(*shape, -1),
+            discount=discount.view(*shape, 1),
+        )
+
+    def _moment(self, name: str, rows: NDArray[np.int64], shape: Sequence[int], seq_length: int) -> Moment:
+        """What there was at some rows."""
+        window = mask = None
+        if seq_length:
+            places, counts, _ = self._windows(rows, seq_length)
+            window = self._take("obs", places, (*shape, seq_length)).transpose(-3, -2)
+            obs = window[..., -1, :]
+            mask = torch.from_numpy(counts).to(obs.device).view(*shape, seq_length)
+        else:
+            obs = self._take("obs", rows, shape)
+        state, recurrent_state = (
+            self._take(column, rows, shape) if column in self._columns else None
+            for column in ("state", "recurrent_state")
+        )
+        return Moment(obs, state, window, mask, recurrent_state, name)
 
     def _places(self, rows: NDArray[Any]) -> Tensor:
         return torch.from_numpy(rows.reshape(-1)).to(self._columns["obs"].device)
@@ -305,7 +364,7 @@ class JointReplayBuffer(Checkpointable):
         Raises:
             ValueError: If the state is of a buffer with another capacity or team.
         """
-        saved = {name: state.get(name, 0) for name in self._arguments}  # states without hidden_size have none
+        saved = {name: state.get(name) for name in self._arguments}
         if saved != self._arguments:
             raise ValueError(f"The saved replay buffer is {saved}, this one {self._arguments}.")
         self._head = state["head"]

@@ -9,7 +9,7 @@ import torch
 
 import rllib_maobs as maobs
 from rllib_maobs.learner import JointLearner
-from rllib_maobs.terms import Columns
+from rllib_maobs.replay import Batch, Moment
 
 torch.set_num_threads(1)
 
@@ -30,7 +30,7 @@ def small_config(algorithm: str, **options: Any) -> maobs.JointConfig:
     Actions are of the first kind that the algorithm takes.
     """
     config = maobs.ALGORITHMS[algorithm]()
-    if config.abilities.actions[0] == "discrete":
+    if config.supports.actions[0] == "discrete":
         options = {"action_mode": "discrete", **options}
     config.environment("maobs/spread-3a", env_config=options)
     config.env_runners(num_envs_per_env_runner=2)
@@ -39,7 +39,7 @@ def small_config(algorithm: str, **options: Any) -> maobs.JointConfig:
     return config.debugging(seed=0)
 
 
-def random_columns(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Columns:
+def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Batch:
     """Random joint transitions for a validated config, some of them terminal, as replay would give them."""
     generator = torch.Generator().manual_seed(seed)
     team = config.team
@@ -56,27 +56,26 @@ def random_columns(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> 
         noise = torch.rand((size, n, a), generator=generator)
     else:
         actions, noise = torch.tanh(normal(size, n, a)) * legal, normal(size, n, a)
-    team_reward = config.abilities.team_reward
-    columns = {
-        "actions": actions,
-        "rewards": normal(size, 1).expand(-1, n).clone() if team_reward else normal(size, n),
-        "discount": config.gamma**config.n_step * (normal(size, 1) < 0.5).to(torch.get_default_dtype()),
-        "noise": noise,
-    }
-    for prefix in ("", "next_"):
-        if config.actor == "lstm":
+    rewards = normal(size, 1).expand(-1, n).clone() if config.supports.team_reward else normal(size, n)
+    discount = config.gamma**config.n_step * (normal(size, 1) < 0.5).to(torch.get_default_dtype())
+
+    def moment(name: str) -> Moment:
+        obs = normal(size, n, o) * present
+        window = mask = recurrent_state = state = None
+        if config.recurrent:
             length = config.seq_length
-            columns[f"{prefix}window"] = normal(size, length, n, o) * present
+            window = normal(size, n, length, o) * present[:, None]
+            obs = window[:, :, -1]
             # Windows of all lengths: what lies before the first observation is not empty, but does not count.
             count = torch.randint(1, length + 1, (size, 1), generator=generator)
-            columns[f"{prefix}mask"] = (torch.arange(length) >= length - count).to(torch.get_default_dtype())
-        else:
-            columns[f"{prefix}obs"] = normal(size, n, o) * present
-        if config.carry_hidden:
-            columns[f"{prefix}hidden"] = normal(size, n, 2, config.hidden_size)
+            mask = (torch.arange(length) >= length - count).to(torch.get_default_dtype())
+        if config.stored_state:
+            recurrent_state = normal(size, n, 2, config.model_config["lstm_cell_size"])
         if config.critic_state == "world" and config.uses_state:
-            columns[f"{prefix}state"] = normal(size, config.state_size)
-    return columns
+            state = normal(size, config.state_size)
+        return Moment(obs, state, window, mask, recurrent_state, name)
+
+    return Batch(moment("now"), moment("next"), actions, rewards, discount, noise)
 
 
 def build_learner(config: maobs.JointConfig) -> JointLearner:

@@ -1,9 +1,9 @@
 """Every algorithm's losses, written from the equations as loops over agents in plain PyTorch.
 
-It shares no code with the package: networks are lists of weight matrices taken from its modules, nothing is stacked,
-padded or masked: windows are unrolled by `torch.nn.LSTMCell` over the observations that count and no others, agents
-with shorter observations get theirs without the padding, and agents that share a policy use the very same tensors, so
-that autograd adds their gradients up.
+It shares no code with the package but the names of a minibatch's parts: networks are lists of weight matrices taken
+from its modules, nothing is stacked, padded or masked: windows are unrolled by `torch.nn.LSTMCell` over the
+observations that count and no others, agents with shorter observations get theirs without the padding, and agents that
+share a policy use the very same tensors, so that autograd adds their gradients up.
 """
 
 from typing import Any
@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+
+from rllib_maobs.replay import Batch, Moment
 
 Layers = list[Tensor]  # weight, bias, weight, bias, ...
 
@@ -55,6 +57,7 @@ class Equations:
         modules = {mid: learner.module[mid] for mid in self.config.module_ids}
         kinds = ["utility"] if hasattr(next(iter(modules.values())), "utility") else ["actor", "critic"]
         self.nets: dict[str, list[Layers]] = {}
+        self.optimizers: dict[str, torch.optim.Adam] = {}
         for kind in (*kinds, *(f"target_{kind}" for kind in kinds)):
             own = {mid: leaves(getattr(module, kind)) for mid, module in modules.items()}
             first = own[self.config.module_ids[0]]
@@ -69,59 +72,59 @@ class Equations:
 
     # What the networks see.
 
-    def seen(self, sample: dict[str, Tensor], row: int, agent: int, prefix: str) -> Tensor:
+    def seen(self, moment: Moment, row: int, agent: int) -> Tensor:
         """What an agent sees: its observations `(t, O)`, the last one being the present one."""
         size = self.sizes[agent]
-        if f"{prefix}window" in sample:
-            counts = int(sample[f"{prefix}mask"][row].sum())
-            return sample[f"{prefix}window"][row, -counts:, agent, :size]
-        return sample[f"{prefix}obs"][row, None, agent, :size]
+        if moment.window is not None and moment.mask is not None:
+            counts = int(moment.mask[row].sum())
+            return moment.window[row, agent, -counts:, :size]
+        return moment.obs[row, None, agent, :size]
 
-    def output(self, kind: str, sample: dict[str, Tensor], row: int, agent: int, prefix: str = "") -> Tensor:
-        observations, layers = self.seen(sample, row, agent, prefix), self.nets[kind][agent]
+    def output(self, kind: str, moment: Moment, row: int, agent: int) -> Tensor:
+        observations, layers = self.seen(moment, row, agent), self.nets[kind][agent]
         if self.config.actor == "mlp":
             return mlp(layers, observations[-1])
-        start = sample[f"{prefix}hidden"][row, agent] if self.config.carry_hidden else None
+        start = None if moment.recurrent_state is None else moment.recurrent_state[row, agent]
         return lstm(layers, observations, start)
 
-    def state(self, sample: dict[str, Tensor], row: int, prefix: str) -> Tensor:
-        if self.config.critic_state == "world":
-            return sample[f"{prefix}state"][row]
+    def state(self, moment: Moment, row: int) -> Tensor:
+        if moment.state is not None:
+            return moment.state[row]
         ids = len(self.agents) if self.config.agent_id_input else 0
-        return torch.cat([self.seen(sample, row, a, prefix)[-1][ids:] for a in self.agents])
+        return torch.cat([self.seen(moment, row, a)[-1][ids:] for a in self.agents])
 
-    def next_action(self, sample: dict[str, Tensor], row: int, agent: int) -> Tensor:
-        output = self.output("target_actor", sample, row, agent, "next_")
+    def next_action(self, sample: Batch, row: int, agent: int) -> Tensor:
+        output = self.output("target_actor", sample.next, row, agent)
         if self.discrete:
             return torch.eye(len(output))[output.argmax()]
         action = torch.tanh(output)
         if self.config.target_noise:
             limit = self.config.target_noise_clip
-            noise = sample["noise"][row, agent, : len(action)] * self.config.target_noise
+            noise = sample.noise[row, agent, : len(action)] * self.config.target_noise
             action = (action + noise.clamp(-limit, limit)).clamp(-1, 1)
         return action
 
-    def action(self, sample: dict[str, Tensor], row: int, agent: int) -> tuple[Tensor, Tensor]:
+    def action(self, sample: Batch, row: int, agent: int) -> tuple[Tensor, Tensor]:
         """The current action of an agent, through which its actor learns, and the output before tanh."""
-        output = self.output("actor", sample, row, agent)
+        output = self.output("actor", sample.now, row, agent)
         if not self.discrete:
             return torch.tanh(output), output
-        uniform = sample["noise"][row, agent, : len(output)]
+        uniform = sample.noise[row, agent, : len(output)]
         soft = torch.softmax((output - torch.log(-torch.log(uniform))) / self.config.gumbel_temperature, 0)
         return torch.eye(len(output))[soft.argmax()] - soft.detach() + soft, output
 
-    def q(self, kind: str, sample: dict[str, Tensor], row: int, agent: int, joint: list[Tensor], prefix: str) -> Tensor:
+    def q(self, kind: str, moment: Moment, row: int, agent: int, joint: list[Tensor]) -> Tensor:
         """Q of one agent's critics in the joint action, one for each of its twins."""
         ids = self.config.agent_id_input and self.config.uses_state
         own = [torch.eye(len(self.agents))[agent]] if ids else []
         if self.name == "iddpg":
-            x = torch.cat([self.seen(sample, row, agent, prefix)[-1], joint[agent]])
+            x = torch.cat([self.seen(moment, row, agent)[-1], joint[agent]])
         elif self.name == "maddpg-l":
             padding = [torch.zeros(max(self.actions) - len(joint[agent]))]
-            x = torch.cat([self.state(sample, row, prefix), joint[agent], *padding, *own])
+            x = torch.cat([self.state(moment, row), joint[agent], *padding, *own])
         else:
             padded = [torch.cat([u, torch.zeros(max(self.actions) - len(u))]) for u in joint]
-            x = torch.cat([self.state(sample, row, prefix), *padded, *own])
+            x = torch.cat([self.state(moment, row), *padded, *own])
         return self.critic(self.nets[kind][agent], x)
 
     def critic(self, layers: Layers, x: Tensor) -> Tensor:
@@ -158,18 +161,18 @@ class Equations:
 
     # The losses.
 
-    def losses(self, sample: dict[str, Tensor], stage: str = "") -> tuple[list[Tensor], list[Tensor]]:
+    def losses(self, sample: Batch, stage: str = "") -> tuple[list[Tensor], list[Tensor]]:
         """The critics' and the actors' losses, one for each agent or one for the team."""
-        rewards = sample["rewards"] * self.config.reward_scale
+        rewards = sample.rewards * self.config.reward_scale
         rows = range(len(rewards))
         critic: dict[int, list[Tensor]] = {}
         actor: dict[int, list[Tensor]] = {}
         for row in rows:
-            r, discount = rewards[row], sample["discount"][row, 0]
+            r, discount = rewards[row], sample.discount[row, 0]
             if self.name in ("iql", "vdn", "qmix"):
                 self.q_learning(sample, row, r, discount, critic)
                 continue
-            taken = [sample["actions"][row, a, : self.actions[a]] for a in self.agents]
+            taken = [sample.actions[row, a, : self.actions[a]] for a in self.agents]
             nexts = [self.next_action(sample, row, a).detach() for a in self.agents]
             now, outputs = zip(*(self.action(sample, row, a) for a in self.agents), strict=True)
             for a in self.agents:
@@ -179,13 +182,13 @@ class Equations:
                 self.facmac(sample, row, r, discount, taken, nexts, now, stage, critic, actor)
                 continue
             for a in self.agents:
-                y = r[a] + discount * self.q("target_critic", sample, row, a, nexts, "next_").min().detach()
-                q = self.q("critic", sample, row, a, taken, "")
+                y = r[a] + discount * self.q("target_critic", sample.next, row, a, nexts).min().detach()
+                q = self.q("critic", sample.now, row, a, taken)
                 critic.setdefault(a, []).append((y - q).square().sum())
                 others = getattr(self.config, "other_agents_actions", "replay")
                 fixed = taken if others == "replay" else [u.detach() for u in now] if others == "current" else now
                 joint = [now[b] if a == b else fixed[b] for b in self.agents]
-                actor.setdefault(a, []).append(-self.q("critic", sample, row, a, joint, "")[0])
+                actor.setdefault(a, []).append(-self.q("critic", sample.now, row, a, joint)[0])
         self.regular = torch.stack(actor.pop(-1)).sum() / len(rows) if actor else torch.zeros(())
 
         def mean(parts: dict[int, list[Tensor]]) -> list[Tensor]:
@@ -195,7 +198,7 @@ class Equations:
 
     def facmac(
         self,
-        sample: dict[str, Tensor],
+        sample: Batch,
         row: int,
         r: Tensor,
         discount: Tensor,
@@ -208,33 +211,31 @@ class Equations:
     ) -> None:
         own = self.config.critic_source == "own"
 
-        def local(kind: str, judge: int, judged: int, u: Tensor, prefix: str) -> Tensor:
-            x = torch.cat([self.seen(sample, row, judged, prefix)[-1], u])
+        def local(kind: str, judge: int, judged: int, u: Tensor, moment: Moment) -> Tensor:
+            x = torch.cat([self.seen(moment, row, judged)[-1], u])
             return self.critic(self.nets[kind][judge], x)[0]
 
         if stage == "local":
             for a in self.agents:
-                y = r[a] + discount * local("target_critic", a, a, nexts[a], "next_").detach()
-                critic.setdefault(a, []).append((y - local("critic", a, a, taken[a], "")).square())
-                actor.setdefault(a, []).append(-local("critic", a, a, now[a], ""))
+                y = r[a] + discount * local("target_critic", a, a, nexts[a], sample.next).detach()
+                critic.setdefault(a, []).append((y - local("critic", a, a, taken[a], sample.now)).square())
+                actor.setdefault(a, []).append(-local("critic", a, a, now[a], sample.now))
             return
         for m, (mixer, target_mixer) in enumerate(zip(self.mixers, self.target_mixers, strict=True)):
-            values = [local("target_critic", m if own else j, j, nexts[j], "next_") for j in self.agents]
-            y = r[0] + discount * self.mixed(target_mixer, values, self.state(sample, row, "next_")).detach()
-            values = [local("critic", m if own else j, j, taken[j], "") for j in self.agents]
-            critic.setdefault(m, []).append((y - self.mixed(mixer, values, self.state(sample, row, ""))).square())
+            values = [local("target_critic", m if own else j, j, nexts[j], sample.next) for j in self.agents]
+            y = r[0] + discount * self.mixed(target_mixer, values, self.state(sample.next, row)).detach()
+            values = [local("critic", m if own else j, j, taken[j], sample.now) for j in self.agents]
+            critic.setdefault(m, []).append((y - self.mixed(mixer, values, self.state(sample.now, row))).square())
             current = [now[j].detach() if own and j != m else now[j] for j in self.agents]
-            values = [local("critic", m if own else j, j, current[j], "") for j in self.agents]
-            actor.setdefault(m, []).append(-self.mixed(mixer, values, self.state(sample, row, "")))
+            values = [local("critic", m if own else j, j, current[j], sample.now) for j in self.agents]
+            actor.setdefault(m, []).append(-self.mixed(mixer, values, self.state(sample.now, row)))
 
-    def q_learning(
-        self, sample: dict[str, Tensor], row: int, r: Tensor, discount: Tensor, critic: dict[int, list[Tensor]]
-    ) -> None:
+    def q_learning(self, sample: Batch, row: int, r: Tensor, discount: Tensor, critic: dict[int, list[Tensor]]) -> None:
         values, nexts = [], []
         for a in self.agents:
-            values.append(self.output("utility", sample, row, a)[sample["actions"][row, a].argmax()])
-            after = self.output("target_utility", sample, row, a, "next_").detach()
-            judge = self.output("utility", sample, row, a, "next_") if self.config.double_q else after
+            values.append(self.output("utility", sample.now, row, a)[sample.actions[row, a].argmax()])
+            after = self.output("target_utility", sample.next, row, a).detach()
+            judge = self.output("utility", sample.next, row, a) if self.config.double_q else after
             nexts.append(after[judge.argmax()])
         if self.name == "iql":
             for a in self.agents:
@@ -243,11 +244,11 @@ class Equations:
         if self.name == "vdn":
             q, next_q = sum(values), sum(nexts)
         else:
-            q = self.mixed(self.mixers[0], values, self.state(sample, row, ""))
-            next_q = self.mixed(self.target_mixers[0], nexts, self.state(sample, row, "next_")).detach()
+            q = self.mixed(self.mixers[0], values, self.state(sample.now, row))
+            next_q = self.mixed(self.target_mixers[0], nexts, self.state(sample.next, row)).detach()
         critic.setdefault(0, []).append((r[0] + discount * next_q - q).square())
 
-    def gradients(self, sample: dict[str, Tensor], stage: str = "") -> dict[str, Any]:
+    def gradients(self, sample: Batch, stage: str = "") -> dict[str, Any]:
         """Losses by role, and gradients: of every distinct network a list, in the order of its parameters."""
         critic, actor = self.losses(sample, stage)
         kind = "utility" if "utility" in self.nets else "critic"
@@ -270,3 +271,18 @@ class Equations:
         # Where a loss is one agent's alone, the others' actions in it are constants: the sum keeps the gradients apart.
         result["actor"] = gradient(torch.stack(actor).sum() + self.regular, distinct(self.nets["actor"]))
         return result
+
+    def update(self, sample: Batch) -> None:
+        """One update: gradients of both roles from the same parameters, then Adam, then Polyak averaging."""
+        found = self.gradients(sample)
+        for role in ("critic", "actor"):
+            online, target = (list({id(n): n for n in self.nets[f"{p}{role}"]}.values()) for p in ("", "target_"))
+            flat = [tensor for net in online for tensor in net]
+            if role not in self.optimizers:
+                self.optimizers[role] = torch.optim.Adam(flat, lr=getattr(self.config, f"{role}_lr"))
+            for tensor, gradient in zip(flat, [g for net in found[role] for g in net], strict=True):
+                tensor.grad = gradient
+            self.optimizers[role].step()
+            with torch.no_grad():
+                for tensor, moved in zip([t for net in target for t in net], flat, strict=True):
+                    tensor.lerp_(moved, self.config.tau)

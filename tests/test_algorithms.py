@@ -15,7 +15,8 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 import rllib_maobs as maobs
-from rllib_maobs.terms import Columns
+from rllib_maobs.modules import Seen
+from rllib_maobs.replay import Batch
 from tests.conftest import ALGORITHMS, small_config
 from tests.test_runner import TwoAgents
 
@@ -73,7 +74,7 @@ def test_random_steps_come_first(ray_session: None) -> None:
     algo.train()
     algo.train()
     obs, actions = (algo.replay_buffer._columns[k][:80] for k in ("obs", "actions"))
-    greedy = algo.env_runner.actors(algo.env_runner.actors.params, (obs, 1))
+    greedy = torch.tanh(algo.env_runner.acting.actors.respond(Seen(obs))[0])
     assert (actions - greedy)[:40].abs().mean() > 0.3
     assert actions[:40].std().item() == pytest.approx(1 / math.sqrt(3), abs=0.02)
     torch.testing.assert_close(actions[40:], greedy[40:])
@@ -82,7 +83,7 @@ def test_random_steps_come_first(ray_session: None) -> None:
 
 @pytest.mark.parametrize(
     ("algorithm", "settings"),
-    [*((name, {}) for name in ALGORITHMS)] + [(a, {"actor": "lstm", "carry_hidden": True}) for a in ("maddpg", "qmix")],
+    [*((name, {}) for name in ALGORITHMS)] + [(a, {"actor": "lstm", "stored_state": True}) for a in ("maddpg", "qmix")],
 )
 def test_a_restored_run_goes_on_exactly_as_the_first(
     ray_session: None, algorithm: str, settings: dict[str, Any], tmp_path: Path
@@ -93,7 +94,7 @@ def test_a_restored_run_goes_on_exactly_as_the_first(
     algo.train()
     path = algo.save_to_path(tmp_path / "checkpoint")
     restored = Algorithm.from_checkpoint(path)
-    assert restored._learner.acting.flat.data_ptr() == restored.env_runner.actors.flat.data_ptr()
+    assert restored._learner.acting.flat.data_ptr() == restored.env_runner.acting.actors.flat.data_ptr()
     for _ in range(2):
         first, second = algo.train(), restored.train()
         for stacks, others in (
@@ -151,7 +152,7 @@ def test_remote_runners_sample_learn_and_survive_a_kill(ray_session: None) -> No
     assert result["num_env_steps_sampled_lifetime"] == 40
     assert result["fault_tolerance"]["num_remote_worker_restarts"] == 0
     (weights,) = algo.env_runner_group.foreach_env_runner(
-        lambda r: r.actors.flat.detach().clone(), local_env_runner=False
+        lambda r: r.acting.actors.flat.detach().clone(), local_env_runner=False
     )
     assert torch.equal(weights, algo._learner.acting.flat)
     (actor,) = algo.env_runner_group._worker_manager.actors().values()
@@ -212,27 +213,43 @@ class PictureAgents(TwoAgents):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c.training(actor_lr=-1e-3), r"actor_lr must be a finite number in \(0, inf\), not -0.001"),
-        (lambda c: c.training(critic_lr=float("nan")), r"critic_lr must be a finite number"),
-        (lambda c: c.training(tau=1.5), r"tau must be a finite number in \(0, 1\], not 1.5"),
-        (lambda c: c.training(gamma=float("inf")), r"gamma must be a finite number in \[0, 1\]"),
-        (lambda c: c.training(updates_per_env_step=-1), r"updates_per_env_step must be a finite number in \[0, inf\)"),
-        (lambda c: c.training(train_batch_size_per_learner=0), r"train_batch_size_per_learner must be .* \[1, inf\)"),
+        (
+            lambda c: c.training(actor_lr=-1e-3),
+            r"MADDPGConfig: actor_lr=-0.001 is illegal; legal: a number > 0 or a list",
+        ),
+        (lambda c: c.training(critic_lr=float("nan")), r"critic_lr=nan is illegal"),
+        (lambda c: c.training(tau=1.5), r"tau=1.5 is illegal; legal: a number > 0 and <= 1"),
+        (lambda c: c.training(gamma=float("inf")), r"gamma=inf is illegal; legal: a number >= 0 and <= 1"),
+        (lambda c: c.training(updates_per_env_step=-1), r"updates_per_env_step=-1 is illegal; legal: a number >= 0"),
+        (
+            lambda c: c.training(train_batch_size_per_learner=0),
+            r"train_batch_size_per_learner=0 is illegal; legal: an integer >= 1",
+        ),
         (lambda c: c.training(train_batch_size_per_learner=9_000), r"\(9000\) must not be larger .*capacity \(5000\)"),
         (lambda c: c.training(num_steps_sampled_before_learning_starts=9_000), r"\(9000\) must not be larger"),
-        (lambda c: c.training(critic_state="all"), r"critic_state must be one of 'observations', 'world', not 'all'"),
-        (lambda c: c.training(other_agents_actions="mine"), r"must be one of 'replay', 'current', 'joint', not 'mine'"),
-        (lambda c: c.training(exploration={"eps": 0.1}), r"Unknown exploration setting 'eps'; legal are"),
-        (lambda c: c.training(grad_clip=0.0), r"grad_clip must be a finite number in \(0, inf\), not 0.0"),
+        (lambda c: c.training(critic_state="all"), r"critic_state='all' is illegal; legal: 'observations', 'world'"),
+        (
+            lambda c: c.training(other_agents_actions="mine"),
+            r"other_agents_actions='mine' is illegal; legal: 'replay', 'current', 'joint'",
+        ),
+        (
+            lambda c: c.training(exploration={"eps": 0.1}),
+            r"EpsilonGaussian has no setting 'eps' .*'epsilon'.*; legal are epsilon, noise",
+        ),
+        (lambda c: c.training(grad_clip=0.0), r"grad_clip=0.0 is illegal; legal: a number > 0 or None"),
         (lambda c: c.training(grad_clip_by="max"), r"grad_clip_by` \(max\) must be one of"),
-        (lambda c: c.training(actor="gru"), r"actor must be one of 'mlp', 'lstm', not 'gru'"),
-        (lambda c: c.training(seq_length=0), r"seq_length must be a finite number in \[1, inf\), not 0"),
-        (lambda c: c.training(seq_length=2.5), r"seq_length must be an integer, not 2.5"),
-        (lambda c: c.training(carry_hidden=True), r"carry_hidden=True .* legal with actor='lstm', not with .*'mlp'"),
-        (lambda c: c.training(n_step=0), r"n_step must be a finite number in \[1, inf\)"),
-        (lambda c: c.training(policy_delay=0), r"policy_delay must be a finite number in \[1, inf\)"),
-        (lambda c: c.training(gumbel_temperature=0.0), r"gumbel_temperature must be a finite number in \(0, inf\)"),
-        (lambda c: c.training(reward_scale=float("nan")), r"reward_scale must be a finite number"),
+        (
+            lambda c: c.training(actor="gru"),
+            r"actor 'gru' is illegal.*; legal are 'mlp', 'lstm', a subclass of Actor, or where",
+        ),
+        (lambda c: c.training(seq_length=0), r"seq_length=0 is illegal; legal: an integer >= 1"),
+        (lambda c: c.training(seq_length=2.5), r"seq_length=2.5 is illegal; legal: an integer >= 1"),
+        (lambda c: c.training(stored_state=True), r"stored_state=True needs a recurrent actor, .*'lstm'; 'mlp' has no"),
+        (lambda c: c.training(carry_hidden=True), r"carry_hidden is now called stored_state"),
+        (lambda c: c.training(n_step=0), r"n_step=0 is illegal; legal: an integer >= 1"),
+        (lambda c: c.training(policy_delay=0), r"policy_delay=0 is illegal; legal: an integer >= 1"),
+        (lambda c: c.training(gumbel_temperature=0.0), r"gumbel_temperature=0.0 is illegal; legal: a number > 0"),
+        (lambda c: c.training(reward_scale=float("nan")), r"reward_scale=nan is illegal"),
         (lambda c: c.rl_module(model_config={"activation": "step"}), r"activation'\] must be one of 'relu', 'tanh'"),
         (lambda c: c.rl_module(model_config={"hidden_sizes": ()}), r"hidden_sizes'\] must be positive integers"),
         (lambda c: c.rl_module(model_config={"lstm_cell_size": 0}), r"lstm_cell_size'\] must be a positive integer"),
@@ -279,13 +296,15 @@ def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) 
         algo = small_config(algorithm).training(critic_state=kind).build_algo()
         critic = algo._learner.module["agent_0"].critic
         assert (critic.from_state.in_features, critic.from_action.in_features) == want
-        seen: list[Columns] = []
-        algo._learner.step = lambda columns, seen=seen: seen.append(columns) or torch.zeros(3, 3)
+        seen: list[Batch] = []
+        algo._learner.step = lambda batch, seen=seen: seen.append(batch) or torch.zeros(3, 3)
         algo.train()
-        batch = algo._learner.prepare(seen[0], {})
-        if kind == "world" and algorithm != "iddpg":
-            assert batch.state.shape[-1] == want[0]
-            torch.testing.assert_close(batch.state[:, :6], batch.obs[..., 2:4].flatten(1))
+        now = algo._learner.prepare(seen[0], {}).now
+        if algorithm == "iddpg":
+            assert now.state is None
+        elif kind == "world":
+            assert now.state.shape[-1] == want[0]
+            torch.testing.assert_close(now.state[:, :12].unflatten(1, (3, 4))[..., :2], now.obs[..., 2:4])
         else:
-            torch.testing.assert_close(batch.state, batch.obs.flatten(1))
+            torch.testing.assert_close(now.state, now.obs.flatten(1))
         algo.stop()

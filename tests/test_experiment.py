@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +18,7 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
+import ray
 from ray.rllib.algorithms import Algorithm
 
 import rllib_maobs as maobs
@@ -25,6 +28,7 @@ from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import STEPS, to_markdown
+from rllib_maobs.experiment.resume import TESTED_RAY, forget_decisions
 
 SCRIPTS = Path(__file__).parent.parent / "tuned_examples"
 EXPERIMENT = Experiment(
@@ -386,6 +390,57 @@ def test_variants_have_settings_of_their_own() -> None:
         Experiment(name="x", env="maobs/tunnel", algorithms=("a",), variants={"a": {"algorithm": "madpg"}}, training={})
 
 
+# --- Tune's saved state -------------------------------------------------------------------------------------------
+
+
+def saved_state(folder: Path, text: str) -> Path:
+    (folder / "experiment_state-2026-01-01_00-00-00.json").write_text("an older one, which nobody reads")
+    path = folder / "experiment_state-2026-02-01_00-00-00.json"
+    path.write_text(text)
+    return path
+
+
+def test_what_tune_meant_to_do_is_forgotten(tmp_path: Path) -> None:
+    state = {"trial_data": [["{}", "{}"]], "runner_data": {"_cached_trial_decisions": {"a": "STOP"}, "_iteration": 7}}
+    path = saved_state(tmp_path, json.dumps(state))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        forget_decisions(tmp_path)
+    state["runner_data"]["_cached_trial_decisions"] = {}  # type: ignore[index]
+    assert json.loads(path.read_text()) == state
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("version", "text", "message"),
+    [
+        ("2.61.0", None, r"Resuming was tried with Ray 2\.60, and this is Ray 2\.61\.0\. So .* may be stopped"),
+        ("2.6.0", None, r"this is Ray 2\.6\.0"),
+        ("2.60.1", "half of a fi", r"state-2026-02-01_00-00-00\.json does not look as Ray 2\.60 writes it\. So "),
+        ("2.60.1", "[]", "does not look"),
+        ("2.60.1", '{"runner_data": []}', "does not look"),
+        ("2.60.1", '{"runner_data": {"_cached_decisions": {}}}', "does not look"),
+        ("2.60.1", '{"runner_data": {"_cached_trial_decisions": ["a"]}}', "does not look"),
+    ],
+)
+def test_a_saved_state_that_is_not_known_is_left_alone_with_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, text: str | None, message: str
+) -> None:
+    monkeypatch.setattr(ray, "__version__", version)
+    text = '{"runner_data": {"_cached_trial_decisions": {"a": "STOP"}}}' if text is None else text
+    path = saved_state(tmp_path, text)
+    with pytest.warns(UserWarning, match=message) as seen:
+        forget_decisions(tmp_path)
+    assert len(seen) == 1
+    assert path.read_text() == text
+
+
+def test_the_release_of_ray_that_is_known_is_the_one_that_is_required() -> None:
+    project = tomllib.loads((SCRIPTS.parent / "pyproject.toml").read_text())["project"]
+    major, minor = TESTED_RAY
+    assert f"ray[rllib,tune]>={major}.{minor},<{major}.{minor + 1}" in project["dependencies"]
+
+
 # --- A whole run --------------------------------------------------------------------------------------------------
 
 STOP = 2000
@@ -424,17 +479,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     folder = tmp_path_factory.mktemp("run")
     results = folder / "results"
     command = [sys.executable, str(SCRIPTS / "spread3a.py"), "--results-dir", str(results)]
-    first = [*command, "--quick", "--stop-timesteps", str(STOP), "--algos", "iddpg", "maddpg", "maddpg-l"]
+    # Tune copies results to the folder with each checkpoint; with one an iteration the first trial is killed early, and
+    # has checkpoints to write after it is resumed: there a decision that is not forgotten would stop it.
+    first = [*command, "--quick", "--stop-timesteps", str(STOP), "--checkpoint-freq", "1"]
+    first += ["--algos", "iddpg", "maddpg", "maddpg-l"]
     with subprocess.Popen(first, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
-            # The third result follows the checkpoint that is made with the second.
-            killed = wait_for(lambda: read_results(results / TRIALS[0])[2:], process)
+            killed = wait_for(lambda: read_results(results / TRIALS[0])[1:], process)
             os.kill(killed[0]["pid"], signal.SIGKILL)
             wait_for((results / TRIALS[0] / "error.txt").exists, process)
             process.send_signal(signal.SIGINT)
             output, _ = process.communicate(timeout=600)
         finally:
             process.kill()
+    assert len(read_results(results / TRIALS[0])) < STOP // 400 - 1, (
+        "killed so late that it has no checkpoint left to write"
+    )
     died_while_saving(results, "iddpg")
     resumed = subprocess.run([*command, "--resume"], cwd=folder, capture_output=True, text=True, timeout=600)
     yield SimpleNamespace(results=results, code=process.returncode, output=output, resumed=resumed)

@@ -7,12 +7,27 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 from torch import nn
+from torch.utils._pytree import tree_map
 
 import rllib_maobs as maobs
-from rllib_maobs.modules import Exploration, LSTMActor, Mixer, MLPActor, Stack
+from rllib_maobs.layout import flat
+from rllib_maobs.learner import TeamNetworks
+from rllib_maobs.modules import (
+    EpsilonGaussian,
+    LSTMActor,
+    Mixer,
+    MLPActor,
+    MLPCritic,
+    PerAgent,
+    RecurrentActor,
+    Seen,
+    Shared,
+    Stack,
+)
+from rllib_maobs.modules.team import Actors
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointEnvRunner
-from tests.conftest import build_learner, random_columns, small_config
+from tests.conftest import build_learner, random_batch, small_config
 
 O, A, H = 4, 2, 8  # noqa: E741
 
@@ -20,7 +35,7 @@ O, A, H = 4, 2, 8  # noqa: E741
 @pytest.fixture
 def actor() -> LSTMActor:
     torch.manual_seed(0)
-    return LSTMActor(O, A, (5, 6), cell_size=H)
+    return LSTMActor(flat(O), A, (5, 6), cell_size=H)
 
 
 def as_torch_lstm(actor: LSTMActor) -> nn.LSTM:
@@ -38,14 +53,14 @@ def test_one_observation_is_a_cell_from_zero(actor: LSTMActor) -> None:
     for mine, theirs in zip(cell.parameters(), as_torch_lstm(actor).parameters(), strict=True):
         mine.data.copy_(theirs)
     h, _ = cell(obs[:, 0])
-    torch.testing.assert_close(actor(obs, torch.ones(5, 1)), torch.tanh(actor.layers(h)))
+    torch.testing.assert_close(actor.unroll(obs, torch.ones(5, 1))[0], actor.layers(h))
 
 
 @pytest.mark.parametrize("users", ["abc", "aaa", "abb", "aba", "aabb", "abab", "abcabd", "aabbcd"])
 def test_agents_that_share_networks_in_any_way(users: str) -> None:
     """A stack's values and gradients are those of each agent calling its network, whatever the agents see alike."""
     torch.manual_seed(0)
-    networks = {name: maobs.Critic(O, A, (H, 6)).double() for name in sorted(set(users))}
+    networks = {name: MLPCritic(flat(O), flat(A), hidden_sizes=(H, 6)).double() for name in sorted(set(users))}
     own = [networks[name] for name in users]
     stack = Stack(own, ("value",))
     each, same = torch.randn(5, len(users), H).double(), torch.randn(5, H).double()
@@ -55,35 +70,36 @@ def test_agents_that_share_networks_in_any_way(users: str) -> None:
         def of(tensor: torch.Tensor, agent: int) -> torch.Tensor:
             return tensor[:, agent] if tensor.dim() == 3 else tensor
 
-        inputs = [(tensor, 1 if tensor.dim() == 3 else None) for tensor in (encoded, u)]
+        inputs = [PerAgent(tensor) if tensor.dim() == 3 else Shared(tensor) for tensor in (encoded, u)]
         expected = torch.stack([net.value(of(encoded, i), of(u, i)) for i, net in enumerate(own)], 1)
-        torch.testing.assert_close(stack(stack.params, *inputs, method="value"), expected)
-        torch.testing.assert_close(stack.act(*inputs, method="value"), expected.detach())
+        torch.testing.assert_close(stack(stack.params, *inputs, function="value"), expected)
+        torch.testing.assert_close(stack.act(*inputs, function="value"), expected.detach())
         weights = torch.arange(1.0, len(users) + 1).double()[:, None]
-        flat = stack.flat.detach().requires_grad_()
-        value = (stack(stack.unflatten(flat), *inputs, method="value") * weights).sum()
-        gradient = stack.unflatten(torch.autograd.grad(value, flat)[0])
+        vector = stack.flat.detach().requires_grad_()
+        value = (stack(stack.unflatten(vector), *inputs, function="value") * weights).sum()
+        gradient = stack.unflatten(torch.autograd.grad(value, vector)[0])
         for name, network in networks.items():
             parameters = dict(network.rest.named_parameters(prefix="rest"))
             wanted = torch.autograd.grad((expected * weights).sum(), list(parameters.values()), retain_graph=True)
             for key, want in zip(parameters, wanted, strict=True):
-                torch.testing.assert_close(gradient[key][stack.rows[users.index(name)]], want)
+                torch.testing.assert_close(stack.own(gradient, users.index(name))[key], want)
 
 
 @pytest.mark.parametrize("network", [MLPActor, LSTMActor])
 def test_acting_plays_back_what_the_networks_would_do(network: type) -> None:
     """To the bit, for every shape of inputs, with the parameters of the moment, of its own or another stack's."""
-    stack, other = (Stack([network(O, A, (H, 6)) for _ in range(3)]) for _ in range(2))
+    names = ["a", "b", "c"]
+    stack, other = (Actors([network(flat(O), A, (H, 6)) for _ in range(3)], names) for _ in range(2))
 
-    def inputs(copies: int) -> list[tuple[torch.Tensor, int | None]]:
+    def inputs(copies: int) -> Seen:
         if network is MLPActor:
-            return [(torch.randn(copies, 3, O), 1)]
-        return [(torch.randn(copies, 5, 3, O), 2), ((torch.rand(copies, 5) > 0.3).float(), None)]
+            return Seen(torch.randn(copies, 3, O))
+        return Seen(torch.randn(copies, 3, 5, O), (torch.rand(copies, 5) > 0.3).float())
 
     def check(copies: int) -> None:
         seen = inputs(copies)
-        action = stack.act(*seen)
-        assert torch.equal(action, stack(stack.params, *seen)) and not action.requires_grad
+        outputs = stack.respond(seen)[0]
+        assert torch.equal(outputs, stack.outputs(stack.params, seen)[0]) and not outputs.requires_grad
 
     check(2)
     check(7)
@@ -98,7 +114,7 @@ def test_a_window_longer_than_the_episode_is_a_full_unroll(actor: LSTMActor) -> 
     _, (h, _) = as_torch_lstm(actor)(episode)
     window = torch.cat([torch.randn(5, 3, O), episode], dim=1)
     mask = (torch.arange(9) >= 3).float().expand(5, -1)
-    torch.testing.assert_close(actor(window, mask), torch.tanh(actor.layers(h[0])), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(actor.unroll(window, mask)[0], actor.layers(h[0]), rtol=1e-5, atol=1e-6)
 
 
 def test_what_lies_in_the_padding_changes_nothing(actor: LSTMActor) -> None:
@@ -108,7 +124,7 @@ def test_what_lies_in_the_padding_changes_nothing(actor: LSTMActor) -> None:
     other[:, :2] = 1e6
     results = []
     for seen, counts in ((window, mask), (other, mask), (window[:, 2:], mask[:, 2:])):
-        action = actor(seen, counts)
+        action = actor.unroll(seen, counts)[0]
         results.append((action, *torch.autograd.grad(action.sum(), list(actor.parameters()))))
     for changed in results[1:]:
         for x, y in zip(results[0], changed, strict=True):
@@ -118,16 +134,31 @@ def test_what_lies_in_the_padding_changes_nothing(actor: LSTMActor) -> None:
 def test_a_carried_state_goes_on(actor: LSTMActor) -> None:
     """Two windows, the second from the first one's h and c, are one long window."""
     window, mask = torch.randn(5, 6, O), torch.ones(5, 6)
-    hidden = actor.carry(window[:, :4], mask[:, :4])
-    torch.testing.assert_close(actor(window[:, 4:], mask[:, 4:], hidden), actor(window, mask))
-    torch.testing.assert_close(actor.head(actor.carry(window[:, 4:], mask[:, 4:], hidden)), actor(window, mask))
+    _, state = actor.unroll(window[:, :4], mask[:, :4])
+    for got, want in zip(actor.unroll(window[:, 4:], mask[:, 4:], state), actor.unroll(window, mask), strict=True):
+        torch.testing.assert_close(got, want)
+
+
+def test_without_a_mask_all_observations_count(actor: LSTMActor) -> None:
+    window = torch.randn(5, 6, O)
+    for got, want in zip(actor.unroll(window), actor.unroll(window, torch.ones(5, 6)), strict=True):
+        assert torch.equal(got, want)
+
+
+def test_the_fast_unroll_is_the_plain_one(actor: LSTMActor) -> None:
+    """`LSTMActor.unroll` leaves out products with zeros; `RecurrentActor.unroll` goes step by step."""
+    window, mask = torch.randn(5, 6, O), (torch.arange(6) >= 2).float().expand(5, -1)
+    for state in (None, torch.randn(5, 2, H)):
+        fast, plain = actor.unroll(window, mask, state), RecurrentActor.unroll(actor, window, mask, state)
+        for got, want in zip(fast, plain, strict=True):
+            torch.testing.assert_close(got, want)
 
 
 def test_the_cell_has_a_size_of_its_own(ray_session: None) -> None:
     """The layers after it and the critic keep theirs; agents saved before there was the setting load as they were."""
-    config = small_config("maddpg-lstm").training(carry_hidden=True).rl_module(model_config={"lstm_cell_size": 5})
+    config = small_config("maddpg-lstm").training(stored_state=True).rl_module(model_config={"lstm_cell_size": 5})
     module = build_learner(config).module["agent_0"]
-    assert config.hidden_size == module.actor.from_hidden.in_features == module.actor.layers[0].in_features == 5
+    assert module.actor.initial_state().shape == (2, 5) and module.actor.layers[0].in_features == 5
     assert [module.actor.layers[0].out_features, module.critic.from_state.out_features] == [64, 64]
     old = {name: value for name, value in module.model_config.items() if name != "lstm_cell_size"}
     spaces = {"observation_space": module.observation_space, "action_space": module.action_space}
@@ -138,50 +169,48 @@ def test_the_cell_has_a_size_of_its_own(ray_session: None) -> None:
 @pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
 def test_the_action_taken_is_the_learners_recomputation(ray_session: None, algorithm: str, carried: bool) -> None:
     """From the runner through replay to the learner: the same windows, the same actions, to 1e-6."""
-    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, carry_hidden=carried)
+    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, stored_state=carried)
     learner = build_learner(config)
     runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
     runner.share(learner.acting, None)
     team = config.team
-    sizes = len(team.agents), team.observation_size, team.action_size, 0, config.hidden_size
+    sizes = len(team.agents), team.observation_size, team.action_size, 0, (2, 64) if carried else None
     buffer = JointReplayBuffer(400, *sizes, seed=0)
     for length in (3, 20, 31):
         (sample,) = runner.sample(num_timesteps=2 * length, explore=False)
         buffer.add(**vars(sample))
-    columns = buffer.sample((300,), gamma=0.9, seq_length=4)
-    assert set(columns["mask"].sum(1).tolist()) == {1.0, 2.0, 3.0, 4.0}
-    batch = learner.prepare(columns, {})
+    batch = learner.prepare(buffer.sample((300,), gamma=0.9, seq_length=4), {})
+    assert set(batch.now.mask.sum(1).tolist()) == {1.0, 2.0, 3.0, 4.0}
+    assert (batch.now.recurrent_state is not None) == carried
+    online = TeamNetworks(learner.parts, learner._params_of(learner._roles))
     with torch.no_grad():
-        outputs = learner.acting(learner.acting.params, *zip(batch.history, (1, None, 1), strict=False))
-    assert len(batch.history) == 2 + carried
+        outputs = online.outputs(batch.now)
     if team.discrete:
         assert torch.equal(outputs.argmax(-1), batch.actions.argmax(-1))
     else:
-        torch.testing.assert_close(outputs, batch.actions, rtol=0, atol=1e-6)
+        torch.testing.assert_close(torch.tanh(outputs), batch.actions, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
 def test_h_and_c_go_from_window_to_window(ray_session: None, algorithm: str) -> None:
     """Zero at an episode's start, then what the last window ended with, whatever chooses actions; zero would differ."""
-    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, carry_hidden=True)
+    config = small_config(algorithm, horizon=7).training(actor="lstm", seq_length=4, stored_state=True)
     learner = build_learner(config.training(normalize_observations=True))
     runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
-    learner.observe(np.random.default_rng(0).normal(1.0, 2.0, (50, 3, 18)).astype(np.float32))
+    learner.update_normalizers(np.random.default_rng(0).normal(1.0, 2.0, (50, 3, 18)).astype(np.float32))
     runner.share(learner.acting, learner.normalizers)
     for how in ({"explore": False}, {"explore": True}, {"random_actions": True}):
         (sample,) = runner.sample(num_timesteps=2 * 31, force_reset=True, **how)
         team = config.team
-        buffer = JointReplayBuffer(400, 3, team.observation_size, team.action_size, 0, config.hidden_size, seed=0)
+        buffer = JointReplayBuffer(400, 3, team.observation_size, team.action_size, 0, (2, 64), seed=0)
         buffer.add(**vars(sample))
-        columns = buffer.sample((300,), gamma=0.9, seq_length=4)
-        starts = columns["mask"].sum(1) == 1
-        assert torch.equal(columns["hidden"].flatten(1).any(1), ~starts) and starts.any()
-        history = learner.prepare(columns, learner.normalizers.params).history
-        seen = list(zip(history, (1, None, 1), strict=True))
-        with torch.no_grad():
-            ended = runner.actors(runner.actors.params, *seen, method="carry")
-            from_zero = runner.actors(runner.actors.params, *seen[:2], method="carry")
-        torch.testing.assert_close(columns["next_hidden"], ended, rtol=0, atol=1e-6)
+        batch = learner.prepare(buffer.sample((300,), gamma=0.9, seq_length=4), learner.normalizers.params)
+        starts = batch.now.mask.sum(1) == 1
+        assert torch.equal(batch.now.recurrent_state.flatten(1).any(1), ~starts) and starts.any()
+        actors, (_, _, window, mask, state, _) = runner.acting.actors, batch.now
+        ended = actors.respond(Seen(window, mask, state))[1]
+        from_zero = actors.respond(Seen(window, mask))[1]
+        torch.testing.assert_close(batch.next.recurrent_state, ended, rtol=0, atol=1e-6)
         assert ((ended - from_zero).abs().flatten(1).amax(1) > 1e-3).equal(~starts)
 
 
@@ -192,11 +221,11 @@ def test_windows_do_not_cross_a_reset_in_acting(ray_session: None) -> None:
     runner = JointEnvRunner(config=config, worker_index=0, num_workers=0)
     (sample,) = runner.sample(num_timesteps=2 * 8, explore=False)
     (again,) = runner.sample(num_episodes=2, explore=False)
-    stack, alone = runner.actors, torch.ones(2, 1)
+    actors, alone = runner.acting.actors, torch.ones(2, 1)
     for part, step in ((sample, 0), (sample, 5), (again, 0)):
         first = torch.from_numpy(part.obs[step])[:, :, None]  # (E, N, T = 1, O)
-        want = stack(stack.params, (first, 1), (alone, None))
-        np.testing.assert_allclose(part.actions[step], want.detach().numpy(), atol=1e-6)
+        want = torch.tanh(actors.respond(Seen(first, alone))[0])
+        np.testing.assert_allclose(part.actions[step], want.numpy(), atol=1e-6)
 
 
 def test_the_lstm_module_works_in_rllibs_own_runner(ray_session: None) -> None:
@@ -220,7 +249,7 @@ def test_the_lstm_module_works_in_rllibs_own_runner(ray_session: None) -> None:
 @pytest.mark.parametrize("algorithm", ["maddpg-lstm", "qmix"])
 def test_carried_h_and_c_are_the_same_in_both_runners(ray_session: None, algorithm: str) -> None:
     """Ours, shown the observations of RLlib's, ends every window with the same h and c and acts the same."""
-    config = small_config(algorithm, horizon=7).training(actor="lstm", carry_hidden=True)
+    config = small_config(algorithm, horizon=7).training(actor="lstm", stored_state=True)
     config.env_runners(num_envs_per_env_runner=1).validate()
     joint = JointEnvRunner(config=config, worker_index=0, num_workers=0)
     config.env_runner_cls = MultiAgentEnvRunner
@@ -228,14 +257,14 @@ def test_carried_h_and_c_are_the_same_in_both_runners(ray_session: None, algorit
     joint.module.set_state(stock.module.get_state())
     for episode in stock.sample(num_episodes=2, explore=False):
         agents = [episode.agent_episodes[agent] for agent in joint.team.agents]
-        joint._forget(np.ones(1, dtype=np.bool_))
+        joint.acting.forget(np.ones(1, dtype=np.bool_))
         for t in range(7):
-            acted = joint._act(np.stack([agent.get_observations(t) for agent in agents])[None], False, False)[0]
+            acted = joint.acting(np.stack([agent.get_observations(t) for agent in agents])[None], 0, explore=False)[0]
             want = np.stack([agent.get_actions(t) for agent in agents])
             np.testing.assert_allclose(acted.argmax(-1) if joint.team.discrete else acted, want, atol=1e-6)
             states = [agent.get_extra_model_outputs("state_out", t) for agent in agents]
-            want = np.stack([[state["hidden"], state["cell"]] for state in states])
-            np.testing.assert_allclose(joint._hidden()[0], want, atol=1e-6)
+            want = np.stack([state["recurrent_state"] for state in states])
+            np.testing.assert_allclose(joint.acting.recurrent_state[0], want, atol=1e-6)
     assert stock.sample(num_timesteps=4, explore=True)
 
 
@@ -253,7 +282,7 @@ def test_discrete_modules_act_in_both_runners(ray_session: None, algorithm: str)
     joint = JointEnvRunner(config=config, worker_index=0, num_workers=0)
     (sample,) = joint.sample(num_timesteps=12, explore=False)
     assert set(np.unique(sample.actions)) == {0.0, 1.0} and (sample.actions.sum(-1) == 1).all()
-    values = joint.actors(joint.actors.params, (torch.from_numpy(sample.obs[2]), 1))
+    values, _ = joint.acting.actors.respond(Seen(torch.from_numpy(sample.obs[2])))
     assert np.array_equal(values.argmax(-1).numpy(), sample.actions[2].argmax(-1))
     (random,) = joint.sample(num_timesteps=2000, random_actions=True)
     np.testing.assert_allclose(random.actions.mean((0, 1, 2)), 0.2, atol=0.03)
@@ -270,14 +299,14 @@ def test_discrete_exploration() -> None:
     values = torch.tensor([1.0, 3.0, 2.0, -torch.inf]).expand(20_000, -1)
     generator = torch.Generator().manual_seed(0)
 
-    def shares(exploration: Exploration, sample: bool) -> list[float]:
+    def shares(exploration: EpsilonGaussian, sample: bool) -> list[float]:
         drawn = exploration.discrete(values, 0, generator, sample=sample)
         return (torch.bincount(drawn, minlength=4) / len(drawn)).tolist()
 
     third = 0.3 / 3
-    assert shares(Exploration(epsilon=0.3), False) == pytest.approx([third, 0.7 + third, third, 0], abs=0.01)
+    assert shares(EpsilonGaussian(epsilon=0.3), False) == pytest.approx([third, 0.7 + third, third, 0], abs=0.01)
     softmax = torch.softmax(values[0], 0).tolist()
-    assert shares(Exploration(epsilon=0.0), True) == pytest.approx(softmax, abs=0.01)
+    assert shares(EpsilonGaussian(epsilon=0.0), True) == pytest.approx(softmax, abs=0.01)
 
 
 def mixers(monotone: bool) -> tuple[Mixer, torch.Tensor, torch.Tensor]:
@@ -316,7 +345,7 @@ def test_each_agents_best_action_is_the_teams_for_qmix_and_vdn_only() -> None:
 def test_vdn_is_the_plain_sum(ray_session: None) -> None:
     learner = build_learner(small_config("vdn"))
     q = torch.randn(7, 3)
-    torch.testing.assert_close(learner.total({}, q, torch.zeros(7, 1)), q[:, :1] + q[:, 1:2] + q[:, 2:])
+    torch.testing.assert_close(learner.total(None, q, None), q[:, :1] + q[:, 1:2] + q[:, 2:])
 
 
 @pytest.mark.parametrize(
@@ -327,7 +356,7 @@ def test_every_kind_of_module_leaves_its_checkpoint(
     ray_session: None, tmp_path, algorithm: str, shared: bool, carried: bool
 ) -> None:
     """Each acts alone; shared parameters are there once; the mixer is a module of its own."""
-    config = small_config(algorithm).training(carry_hidden=carried)
+    config = small_config(algorithm).training(stored_state=carried)
     if shared:
         config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *a, **k: "all")
     algo = config.build_algo()
@@ -344,7 +373,7 @@ def test_every_kind_of_module_leaves_its_checkpoint(
         got, want = (m.forward_inference({"obs": obs, "state_in": state}) for m in (module, trained))
         # Alone its weights lie in another order in memory, which moves the last digit.
         torch.testing.assert_close(got["actions"], want["actions"], rtol=0.0, atol=1e-6)
-        assert ("cell" in got.get("state_out", {})) == carried
+        assert ("recurrent_state" in got.get("state_out", {})) == carried
     parameters = sum(p.numel() for p in algo._learner.module[names[0]].parameters())
     stacked = sum(
         s.flat.numel() for r, s in (*algo._learner._roles.items(), *algo._learner._targets.items()) if r != "mixer"
@@ -368,7 +397,7 @@ def test_normalised_observations_survive_a_checkpoint(ray_session: None, tmp_pat
     first, second = algo.train(), restored.train()
     assert first["env_runners"]["num_env_steps_sampled"] == second["env_runners"]["num_env_steps_sampled"]
     assert torch.equal(algo._learner.normalizers.flat, restored._learner.normalizers.flat)
-    assert restored.env_runner.normalizers.flat.data_ptr() == restored._learner.normalizers.flat.data_ptr()
+    assert restored.env_runner.acting.normalizers.flat.data_ptr() == restored._learner.normalizers.flat.data_ptr()
     algo.stop()
     restored.stop()
 
@@ -387,15 +416,17 @@ def test_random_numbers_of_the_losses_survive_a_checkpoint(ray_session: None, tm
     restored.stop()
 
 
-def test_columns_of_the_tests_are_those_of_replay(ray_session: None) -> None:
-    """The random columns that the learner's tests use have the names and shapes that replay gives."""
-    for algorithm, carried in (("maddpg", False), ("maddpg-lstm", False), ("qmix", False), ("maddpg-lstm", True)):
-        config = small_config(algorithm).training(critic_state="world", carry_hidden=carried)
+def test_batches_of_the_tests_are_those_of_replay(ray_session: None) -> None:
+    """The random batches that the learner's tests use have the names and shapes that replay gives."""
+    for algorithm, stored in (("maddpg", False), ("maddpg-lstm", False), ("qmix", False), ("maddpg-lstm", True)):
+        config = small_config(algorithm).training(critic_state="world", stored_state=stored)
         algo = config.build_algo()
         algo.train()
-        seq_length = 3 if config.actor == "lstm" else 0
-        columns = algo.replay_buffer.sample((32,), gamma=0.9, seq_length=seq_length)
-        made = random_columns(algo.config, size=32)
-        made.pop("noise")
-        assert {k: v.shape for k, v in columns.items()} == {k: v.shape for k, v in made.items()}
+        batch = algo.replay_buffer.sample((32,), gamma=0.9, seq_length=algo.config.window_length)
+        made = random_batch(algo.config, size=32)._replace(noise=None)
+
+        def shapes(part: object) -> object:
+            return part.shape if isinstance(part, torch.Tensor) else part
+
+        assert tree_map(shapes, batch) == tree_map(shapes, made)
         algo.stop()

@@ -12,6 +12,18 @@ N, O, A, S, H = 3, 4, 2, 5, 6  # noqa: E741
 G = 0.9
 
 
+def drawn(buffer: JointReplayBuffer, shape: tuple[int, ...], **how: Any) -> dict[str, torch.Tensor]:
+    """A sample as one dict; what there was n steps later has "next_" before its name, windows have T before N."""
+    batch = buffer.sample(shape, **how)
+    columns = {"actions": batch.actions, "rewards": batch.rewards, "discount": batch.discount}
+    for prefix, moment in (("", batch.now), ("next_", batch.next)):
+        columns |= {f"{prefix}{k}": v for k, v in moment._asdict().items() if isinstance(v, torch.Tensor)}
+        if moment.window is not None:
+            assert torch.equal(moment.obs, moment.window[..., -1, :])
+            columns[f"{prefix}window"] = moment.window.transpose(-3, -2)
+    return columns
+
+
 class Simulator:
     """E copies whose every number tells copy, episode, step and agent; episodes of copy e last 3 + e steps."""
 
@@ -56,7 +68,7 @@ class Simulator:
         if state:
             columns |= {"state": np.stack(states), "final_state": np.concatenate(final_states)}
         if hidden:
-            columns |= {"hidden": np.stack(hiddens), "final_hidden": np.concatenate(final_hiddens)}
+            columns |= {"recurrent_state": np.stack(hiddens), "final_recurrent_state": np.concatenate(final_hiddens)}
         return columns
 
 
@@ -84,7 +96,7 @@ def test_transitions_never_mix_episodes_copies_or_agents(copies: int, fragment: 
     for _ in range(60 // fragment):
         buffer.add(**simulator.fragment(fragment))
     for _ in range(30):
-        batch = buffer.sample((256,), gamma=G)
+        batch = drawn(buffer, (256,), gamma=G)
         check(batch, copies)
         seen |= set(batch["obs"][:, 0, 0].round().long().tolist())
     # All steps are drawn but the last ones, whose next observation is not there yet.
@@ -97,9 +109,9 @@ def test_the_newest_step_waits_for_its_next_observation() -> None:
     simulator = Simulator(1)
     buffer.add(**simulator.fragment(1))
     with pytest.raises(ValueError, match="no complete transition"):
-        buffer.sample((4,), gamma=G)
+        drawn(buffer, (4,), gamma=G)
     buffer.add(**simulator.fragment(1))
-    assert set(buffer.sample((50,), gamma=G)["obs"][:, 0, 0].tolist()) == {0.0}
+    assert set(drawn(buffer, (50,), gamma=G)["obs"][:, 0, 0].tolist()) == {0.0}
 
 
 def test_an_empty_buffer_cannot_be_sampled() -> None:
@@ -117,7 +129,7 @@ def test_old_rows_give_way_and_what_is_left_stays_true(capacity: int) -> None:
         buffer.add(**fragment)
         written += [*fragment["obs"][..., 0, 0].ravel().tolist(), *fragment["final_obs"][:, 0, 0].tolist()]
         if len(buffer) > 10:
-            batch = buffer.sample((64,), gamma=G)
+            batch = drawn(buffer, (64,), gamma=G)
             check(batch, 3)
             assert set(batch["obs"][:, 0, 0].tolist()) <= set(written[-capacity:])
     assert len(buffer) == capacity
@@ -128,7 +140,7 @@ def test_a_fragment_that_fills_the_ring_leaves_no_link_to_what_it_replaced() -> 
     simulator = Simulator(2, length=50)
     for _ in range(3):
         buffer.add(**simulator.fragment(4))
-        check(buffer.sample((100,), gamma=G), 2, length=50)
+        check(drawn(buffer, (100,), gamma=G), 2, length=50)
 
 
 def test_a_lost_fragment_is_not_bridged() -> None:
@@ -141,7 +153,7 @@ def test_a_lost_fragment_is_not_bridged() -> None:
     restarted = Simulator(2, source="other", length=50)
     restarted.episode += 7
     buffer.add(**restarted.fragment(4))
-    batch = buffer.sample((500,), gamma=G)
+    batch = drawn(buffer, (500,), gamma=G)
     check(batch, 2, length=50)
     assert {3, 10} & set((batch["obs"][:, 0, 0] % 10_000).long().tolist()) == set()
 
@@ -153,7 +165,7 @@ def test_two_runners_interleave() -> None:
     for _ in range(10):
         buffer.add(**first.fragment(3))
         buffer.add(**second.fragment(3))
-    check(buffer.sample((500,), gamma=G), 2, length=9)
+    check(drawn(buffer, (500,), gamma=G), 2, length=9)
 
 
 @pytest.mark.parametrize("capacity", [50, 1000])
@@ -165,7 +177,7 @@ def test_windows_are_the_last_observations_of_the_same_episode(capacity: int, fr
     simulator = Simulator(3, length=5)
     for _ in range(140 // fragment):
         buffer.add(**simulator.fragment(fragment))
-    batch = buffer.sample((4, 64), gamma=G, seq_length=length)
+    batch = drawn(buffer, (4, 64), gamma=G, seq_length=length)
     assert batch["window"].shape == batch["next_window"].shape == (4, 64, length, N, O)
     now = batch["window"][:, :, -1]
     torch.testing.assert_close(batch["next_window"][:, :, -1], now + 1)
@@ -189,7 +201,7 @@ def test_windows_do_not_bridge_a_gap(fragment: int) -> None:
     simulator.fragment(3)  # sampled but never arrived
     for _ in range(10 // fragment):
         buffer.add(**simulator.fragment(fragment))
-    batch = buffer.sample((500,), gamma=G, seq_length=4)
+    batch = drawn(buffer, (500,), gamma=G, seq_length=4)
     t = batch["window"][:, -1, 0, 0].round().long()
     since = torch.where(t < 13, t, t - 13)
     assert torch.equal(batch["mask"].sum(1).long(), (since + 1).clamp(max=4))
@@ -205,7 +217,7 @@ def test_returns_of_n_steps_end_with_the_episode(fragment: int) -> None:
     # What was never written (final observations have no reward) may be anything.
     rows = torch.from_numpy(buffer._next == -1)
     buffer._columns["rewards"][rows] = torch.nan
-    batch = buffer.sample((500,), gamma=G, n_step=3, seq_length=2)
+    batch = drawn(buffer, (500,), gamma=G, n_step=3, seq_length=2)
     code = batch["window"][:, -1, 0, 0].round().long()
     copy, episode, t = code // 10_000, code // 100 % 100, code % 100
     # At the newest end of the ring there may be fewer steps than three.
@@ -227,7 +239,7 @@ def test_stored_states_go_with_their_observations() -> None:
     simulator = Simulator(2)
     for _ in range(10):
         buffer.add(**simulator.fragment(3, state=True))
-    batch = buffer.sample((8, 16), gamma=G)
+    batch = drawn(buffer, (8, 16), gamma=G)
     assert batch["state"].shape == (8, 16, S)
     assert torch.equal(batch["state"][..., 0], batch["obs"][..., 0, 0])
     assert torch.equal(batch["next_state"][..., 0], batch["next_obs"][..., 0, 0])
@@ -236,46 +248,46 @@ def test_stored_states_go_with_their_observations() -> None:
 @pytest.mark.parametrize("n_step", [1, 3])
 def test_stored_h_and_c_go_with_the_windows_newest_observations(n_step: int) -> None:
     """Each agent's own, those after the last step with the final observation, also when old rows give way."""
-    buffer = JointReplayBuffer(40, N, O, A, hidden_size=H, seed=0)
+    buffer = JointReplayBuffer(40, N, O, A, recurrent_state=(2, H), seed=0)
     simulator = Simulator(2)
     for _ in range(20):
         buffer.add(**simulator.fragment(3, hidden=True))
         if len(buffer) < 10:
             continue
-        batch = buffer.sample((8, 16), gamma=G, n_step=n_step, seq_length=2)
+        batch = drawn(buffer, (8, 16), gamma=G, n_step=n_step, seq_length=2)
         for name in ("", "next_"):
             now = batch[f"{name}window"][:, :, -1, :, :1, None]
             want = (now + torch.tensor([[0.01], [0.02]])).expand(8, 16, N, 2, H)
-            torch.testing.assert_close(batch[f"{name}hidden"], want, rtol=0, atol=2e-3)
-    with pytest.raises(ValueError, match="stores 'hidden', but none was given"):
+            torch.testing.assert_close(batch[f"{name}recurrent_state"], want, rtol=0, atol=2e-3)
+    with pytest.raises(ValueError, match="stores 'recurrent_state', but none was given"):
         buffer.add(**simulator.fragment(3))
-    extra = JointReplayBuffer(500, N, O, A, hidden_size=H).nbytes - JointReplayBuffer(500, N, O, A).nbytes
+    extra = JointReplayBuffer(500, N, O, A, recurrent_state=(2, H)).nbytes - JointReplayBuffer(500, N, O, A).nbytes
     assert extra == 500 * N * 2 * H * 4
 
 
 def test_sampling_is_uniform() -> None:
     buffer = JointReplayBuffer(50, N, O, A, seed=0)
     buffer.add(**Simulator(1, length=40).fragment(41))
-    counts = np.bincount(buffer.sample((40_000,), gamma=G)["obs"][:, 0, 0].long().numpy(), minlength=40)
+    counts = np.bincount(drawn(buffer, (40_000,), gamma=G)["obs"][:, 0, 0].long().numpy(), minlength=40)
     assert counts.size == 40
     assert np.abs(counts - 1000).max() < 5 * np.sqrt(1000)
 
 
 def test_a_restored_buffer_goes_on_as_the_first() -> None:
     simulator = Simulator(2)
-    buffer = JointReplayBuffer(64, N, O, A, hidden_size=H, seed=0)
+    buffer = JointReplayBuffer(64, N, O, A, recurrent_state=(2, H), seed=0)
     for _ in range(20):
         buffer.add(**simulator.fragment(3, hidden=True))
-    restored = JointReplayBuffer(64, N, O, A, hidden_size=H, seed=99)
+    restored = JointReplayBuffer(64, N, O, A, recurrent_state=(2, H), seed=99)
     restored.set_state(buffer.get_state())
     more = simulator.fragment(3, hidden=True)
     for b in (buffer, restored):
         b.add(**more)
-    first, second = buffer.sample((100,), gamma=G), restored.sample((100,), gamma=G)
+    first, second = drawn(buffer, (100,), gamma=G), drawn(restored, (100,), gamma=G)
     assert all(torch.equal(first[k], second[k]) for k in first)
     with pytest.raises(ValueError, match="'capacity': 64"):
         JointReplayBuffer(65, N, O, A).set_state(buffer.get_state())
-    with pytest.raises(ValueError, match=r"'hidden_size': 6.*'hidden_size': 0"):
+    with pytest.raises(ValueError, match=r"'recurrent_state': \(2, 6\).*'recurrent_state': None"):
         JointReplayBuffer(64, N, O, A).set_state(buffer.get_state())
 
 

@@ -10,7 +10,8 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 
-from rllib_maobs.modules import Exploration
+from rllib_maobs.modules import EpsilonGaussian, Seen
+from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.runner import JointEnvRunner, JointSample
 from tests.conftest import small_config
 
@@ -86,9 +87,10 @@ def test_world_states_are_the_environments_own(ray_session: None) -> None:
     s = sample(runner, num_timesteps=16)
     assert s.state is not None and s.final_state is not None
     assert s.state.shape == (8, 2, runner.team.state_size)
-    # Agents' positions come first in the world state, and are in their own observations.
-    np.testing.assert_allclose(s.state[:, :, :6], s.obs[:, :, :, 2:4].reshape(8, 2, 6), atol=1e-6)
-    np.testing.assert_allclose(s.final_state[:, :6], s.final_obs[:, :, 2:4].reshape(-1, 6), atol=1e-6)
+    # Agents come first in the world state, with their positions, which are in their own observations.
+    for state, obs in ((s.state, s.obs), (s.final_state, s.final_obs)):
+        agents = state[..., :12].reshape(*state.shape[:-1], 3, 4)
+        np.testing.assert_allclose(agents[..., :2], obs[..., 2:4], atol=1e-6)
 
 
 def test_a_copys_episodes_do_not_depend_on_how_many_there_are(ray_session: None) -> None:
@@ -113,8 +115,8 @@ def test_episodes_are_dealt_out_evenly(ray_session: None) -> None:
     assert int(runner.get_metrics()["num_episodes"].peek()) == 10
     # Evaluation is noise-free: the same weights and the same start give the same actions.
     s = sample(runner, num_episodes=4, explore=False)
-    greedy = runner.actors(runner.actors.params, (torch.from_numpy(s.obs[0]), 1))
-    np.testing.assert_allclose(s.actions[0], greedy.detach().numpy(), atol=1e-6)
+    greedy = torch.tanh(runner.acting.actors.respond(Seen(torch.from_numpy(s.obs[0])))[0])
+    np.testing.assert_allclose(s.actions[0], greedy.numpy(), atol=1e-6)
 
 
 def test_returns_are_those_of_the_agents(ray_session: None) -> None:
@@ -129,23 +131,23 @@ def test_returns_are_those_of_the_agents(ray_session: None) -> None:
 
 
 def test_exploration_decays_as_in_the_paper() -> None:
-    explore = Exploration()
+    explore = EpsilonGaussian()
     assert explore.at(0) == (0.1, 0.1)
     assert explore.at(50_000) == pytest.approx((0.075, 0.075))
     assert explore.at(10**7) == (0.05, 0.05)
-    assert Exploration(epsilon=0.0, noise=0.02).at(0) == (0.0, 0.02)
+    assert EpsilonGaussian(epsilon=0.0, noise=0.02).at(0) == (0.0, 0.02)
     generator = torch.Generator().manual_seed(0)
     greedy = torch.full((20_000, 3, 5), 0.5)
     noisy = explore(greedy, 0, generator)
     assert noisy.abs().max() <= 1.0
     uniform = ((noisy - 0.5).abs() > 0.5).any(-1).float().mean().item()
     assert uniform == pytest.approx(0.1 * (1 - 0.5**5), abs=0.005)
-    quiet = Exploration(epsilon=0.0, noise=0.1)(greedy, 0, generator)
+    quiet = EpsilonGaussian(epsilon=0.0, noise=0.1)(greedy, 0, generator)
     assert (quiet - 0.5).std().item() == pytest.approx(0.1, abs=0.002)
-    with pytest.raises(ValueError, match=r"legal are \['decay', 'epsilon', 'final', 'noise'\]"):
-        Exploration.from_dict({"sigma": 0.1})
-    with pytest.raises(ValueError, match=r"exploration\['epsilon'\] must be finite and in \[0, 1\]"):
-        Exploration.from_dict({"epsilon": 1.5})
+    with pytest.raises(ValueError, match="has no setting 'sigma'; legal are epsilon, noise, decay, final"):
+        make_exploration({"sigma": 0.1})
+    with pytest.raises(ValueError, match="EpsilonGaussian: epsilon=1.5 is illegal; legal: a number >= 0 and <= 1"):
+        make_exploration({"epsilon": 1.5})
 
 
 def test_actions_are_unsquashed_to_the_environments_bounds(ray_session: None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -42,13 +42,14 @@ class JointAlgorithm(Algorithm):
     `min_sample_timesteps_per_iteration` takes.
     """
 
+    config_class: ClassVar[type[JointConfig]] = JointConfig
     replay_buffer: JointReplayBuffer
 
     @classmethod
     @override(Algorithm)
     def get_default_config(cls) -> JointConfig:
-        """The settings all algorithms share."""
-        return JointConfig()
+        """The algorithm's settings."""
+        return cls.config_class()
 
     @override(Algorithm)
     def setup(self, config: AlgorithmConfig) -> None:
@@ -62,7 +63,7 @@ class JointAlgorithm(Algorithm):
             team.observation_size,
             team.action_size,
             team.state_size,
-            self.config.hidden_size,
+            self._learner.acting.networks[0].initial_state().shape if self.config.stored_state else None,
             seed=self.config.seed,
             device=self._learner.device,
         )
@@ -87,7 +88,7 @@ class JointAlgorithm(Algorithm):
                 for sample in samples:
                     self._check_reward(sample)
                     self.replay_buffer.add(**vars(sample))
-                    self._learner.observe(sample.obs)
+                    self._learner.update_normalizers(sample.obs)
                     self._progress["env_steps"] += sample.env_steps()
             if self._update():
                 self._sync_remote_runners()
@@ -116,7 +117,7 @@ class JointAlgorithm(Algorithm):
 
     def _check_reward(self, sample: JointSample) -> None:
         """Raises a ValueError where agents' rewards differ but the algorithm's value is that of a team reward."""
-        if not self.config.abilities.team_reward:
+        if not self.config.supports.team_reward:
             return
         spread = np.ptp(sample.rewards, axis=-1)
         if spread.max() > REWARD_TOLERANCE * max(1.0, float(np.abs(sample.rewards).max())):
@@ -135,15 +136,15 @@ class JointAlgorithm(Algorithm):
         while left > 0:
             count = min(left, max(1, _ROWS_PER_DRAW // batch_size))
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
-                columns = self.replay_buffer.sample(
+                batch = self.replay_buffer.sample(
                     (count, batch_size),
                     gamma=self.config.gamma,
                     n_step=self.config.n_step,
-                    seq_length=self.config.seq_length if self.config.actor == "lstm" else 0,
+                    seq_length=self.config.window_length,
                 )
             with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
                 timesteps = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self._progress["env_steps"]}
-                self.learner_group.update(batch=columns, timesteps=timesteps, _no_metrics_reduce=True)
+                self.learner_group.update(batch=batch, timesteps=timesteps, _no_metrics_reduce=True)
             left -= count
         self._progress["updates"] += max(0, owed)
         return owed

@@ -1,68 +1,39 @@
-"""What all algorithms share: settings, what each is defined for, and all checks before a run starts."""
+"""What all algorithms share: settings, and what each algorithm declares."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.policy.policy import PolicySpec
 from ray.rllib.utils.annotations import override
-from ray.util import log_once
 
-from rllib_maobs.envs.team import Team, shares_reward
-from rllib_maobs.learner import MIXER
-from rllib_maobs.modules import ACTIVATIONS, ACTORS, AgentModule, Exploration, MixerModule
-from rllib_maobs.runner import JointEnvRunner, make_env
+from rllib_maobs.algorithms import checks
+from rllib_maobs.envs.team import Team
+from rllib_maobs.layout import Entities, Layout, layout_size
+from rllib_maobs.learner import MIXER, JointLearner
+from rllib_maobs.modules import ACTORS, CRITICS, Actor, AgentModule, Critic, MixerModule, RecurrentActor
+from rllib_maobs.options import Range
+from rllib_maobs.runner import JointEnvRunner
 
-CRITIC_STATES = ("observations", "world")
-_MODEL_SETTINGS = (
-    "hidden_sizes",
-    "activation",
-    "lstm_cell_size",
-    "actor",
-    "seq_length",
-    "carry_hidden",
-    "exploration",
-    "normalize_observations",
-    "critic_state_size",
-    "critic_action_size",
-    "num_critics",
-)
-
-
-def one_of(name: str, value: Any, legal: Collection[str]) -> None:
-    """Raises a ValueError that names the legal values unless the value is one of them."""
-    if value not in legal:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}, not {value!r}.")
-
-
-def in_range(name: str, value: Any, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
-    """Raises a ValueError that names the legal range unless the value is a finite number in it."""
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not number or not (low < value if open_low else low <= value) or value > high:
-        bounds = f"{'(' if open_low else '['}{low:g}, {'inf)' if high == math.inf else f'{high:g}]'}"
-        raise ValueError(f"{name} must be a finite number in {bounds}, not {value!r}.")
-
-
-def own_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
-    """The default policy mapping: every agent has a policy of its own, named like it."""
-    return agent_id
+PositiveInt = Annotated[int, Range(1)]
+NonNegativeInt = Annotated[int, Range(0)]
+Positive = Annotated[float, Range(0.0, exclusive=True)]
+NonNegative = Annotated[float, Range(0.0)]
 
 
 @dataclass(frozen=True)
-class Abilities:
+class Supports:
     """What an algorithm is defined for; validation, the README's table and the tests follow it.
 
     Attributes:
         actions: Kinds of action spaces, of "continuous" and "discrete".
         team_reward: Whether it needs one reward for all agents.
         different_agents: Whether agents may differ in the sizes of their observations and actions.
-        recurrent: Whether it takes `actor="lstm"`.
+        recurrent: Whether it takes recurrent actors.
         parameter_sharing: Whether agents may share a policy.
         twin_critics: Whether it takes `twin_critics` and the rest of TD3.
     """
@@ -78,42 +49,83 @@ class Abilities:
 class JointConfig(AlgorithmConfig):
     """Settings of every algorithm here; the defaults are the paper's (table II), then its code base's.
 
+    An algorithm of your own derives from it, says what its critics see and which learner has its losses, and is made
+    known by `register_algorithm`: docs/your_own.md.
+
     Attributes:
         name: The algorithm's name in scripts and tables.
-        abilities: What it is defined for.
-        uses_state: Whether it sees the global state when it learns.
-        central_critic: Whether it is the critics that see it (and not only a mixer).
+        supports: What it is defined for.
+        critic_sees: What agent i's critic sees: its "observation" or the "state"; and its own "action" or the
+            "joint_action". Empty if there are no critics.
+        mixes: Whether values are mixed with the state into one of the team.
+        learner: The learner that has its losses.
+        legal: What is legal for each setting, as a type hint.
         team: The environment's agents and spaces; filled in by `validate()`.
         module_ids: Every agent's policy, in the team's order; filled in by `validate()`.
     """
 
     name: ClassVar[str] = "joint"
-    abilities: ClassVar[Abilities] = Abilities()
-    uses_state: ClassVar[bool] = True
-    central_critic: ClassVar[bool] = True
-    default_exploration: ClassVar[dict[str, float]] = {}
+    supports: ClassVar[Supports] = Supports()
+    critic_sees: ClassVar[tuple[str, ...]] = ("state", "joint_action")
+    mixes: ClassVar[bool] = False
+    learner: ClassVar[type[JointLearner]] = JointLearner
+    module: ClassVar[type[AgentModule]] = AgentModule
+    default_exploration: ClassVar[dict[str, Any]] = {}
+    legal: ClassVar[dict[str, Any]] = {
+        "actor_lr": Positive | list,
+        "critic_lr": Positive | list,
+        "gamma": Annotated[float, Range(0.0, 1.0)],
+        "tau": Annotated[float, Range(0.0, 1.0, exclusive=True)],
+        "train_batch_size_per_learner": PositiveInt,
+        "replay_buffer_capacity": PositiveInt,
+        "num_envs_per_env_runner": PositiveInt,
+        "updates_per_env_step": NonNegative,
+        "critic_state": Literal["observations", "world"],
+        "seq_length": PositiveInt,
+        "stored_state": bool,
+        "n_step": PositiveInt,
+        "twin_critics": bool,
+        "policy_delay": PositiveInt,
+        "target_noise": NonNegative,
+        "target_noise_clip": NonNegative,
+        "action_regularization": NonNegative,
+        "gumbel_temperature": Positive,
+        "normalize_observations": bool,
+        "reward_scale": Positive,
+        "agent_id_input": bool,
+        "grad_clip": Positive | None,
+        "num_random_steps": NonNegativeInt,
+        "num_steps_sampled_before_learning_starts": NonNegativeInt,
+        "store_buffer_in_checkpoints": bool,
+    }
     ties_critics: bool = False
     team: Team
     module_ids: tuple[str, ...]
 
     @override(AlgorithmConfig)
     def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class)
+        super().__init__(algo_class=algo_class or checks.default_algorithm(type(self)))
         # Paper, table II.
         self.gamma = 0.95
         self.actor_lr: Any = 1e-3
         self.critic_lr: Any = 1e-2
         self.train_batch_size_per_learner = 256
         self.seq_length = 5
-        self.exploration: dict[str, float] = {}
+        self.exploration: dict[str, Any] = {}
         # The code base the paper grew from.
         self.tau = 0.01
         self.replay_buffer_capacity = 500_000
         self.updates_per_env_step = 1.0
         self.critic_state: Literal["observations", "world"] = "observations"
+        # Networks.
+        self.actor: str | type[Actor] = "mlp"
+        self.actor_settings: dict[str, Any] = {}
+        self.critic: str | type[Critic] = "mlp"
+        self.critic_settings: dict[str, Any] = {}
+        self.observation_layouts: Mapping[str, Any] | None = None
+        self.state_layout: Any = None
         # Off by default.
-        self.actor: Literal["mlp", "lstm"] = "mlp"
-        self.carry_hidden = False
+        self.stored_state = False
         self.n_step = 1
         self.twin_critics = False
         self.policy_delay = 1
@@ -147,10 +159,15 @@ class JointConfig(AlgorithmConfig):
         updates_per_env_step: float = NotProvided,
         replay_buffer_capacity: int = NotProvided,
         critic_state: Literal["observations", "world"] = NotProvided,
-        exploration: dict[str, float] = NotProvided,
-        actor: Literal["mlp", "lstm"] = NotProvided,
+        exploration: dict[str, Any] = NotProvided,
+        actor: str | type[Actor] = NotProvided,
+        actor_settings: dict[str, Any] = NotProvided,
+        critic: str | type[Critic] = NotProvided,
+        critic_settings: dict[str, Any] = NotProvided,
+        observation_layouts: Mapping[str, Any] | None = NotProvided,
+        state_layout: Any = NotProvided,
         seq_length: int = NotProvided,
-        carry_hidden: bool = NotProvided,
+        stored_state: bool = NotProvided,
         n_step: int = NotProvided,
         twin_critics: bool = NotProvided,
         policy_delay: int = NotProvided,
@@ -169,7 +186,7 @@ class JointConfig(AlgorithmConfig):
         """Sets the training settings.
 
         Hidden sizes and activation are RLlib's to set: `config.rl_module(model_config={"hidden_sizes": (64, 64, 64),
-        "activation": "relu", "lstm_cell_size": 48})`. Parameter sharing is RLlib's policy mapping: agents with one
+        "activation": "relu", "lstm_cell_size": 64})`. Parameter sharing is RLlib's policy mapping: agents with one
         policy share its networks.
 
         Args:
@@ -182,14 +199,24 @@ class JointConfig(AlgorithmConfig):
             replay_buffer_capacity: Rows of the replay ring, one per joint step. Default 500 000.
             critic_state: What a centralised critic or mixer sees as s: "observations", the concatenation of all
                 agents' (default, the code base's), or "world", the environment's own `state()`.
-            exploration: Overrides of `Exploration`: `epsilon` 0.1, `noise` 0.1, `decay` 5e-7 per env step,
-                `final` 0.05 (the paper's; algorithms of the Q-learning family have others).
-            actor: "mlp" (default), or "lstm" over the last `seq_length` observations (eq. 10).
-            seq_length: T, the window of an LSTM actor. Default 5 (table II).
-            carry_hidden: Whether an LSTM's window starts from the h and c with which the one a step earlier ended, zero
-                at an episode's start (eq. 10), instead of always from zero. Learning starts from those of acting,
-                stored in replay (2 H floats for each agent and row), as constants (Kapturowski et al. 2019). Needs
-                `actor="lstm"`. Default False.
+            exploration: Settings of `EpsilonGaussian`: `epsilon` 0.1, `noise` 0.1, `decay` 5e-7 per env step,
+                `final` 0.05 (the paper's; algorithms of the Q-learning family have others). Or another kind with its
+                settings: `{"type": "ornstein-uhlenbeck", "theta": 0.15}`, `{"type": MyNoise}` (see `Exploration`).
+                Policies may differ: `config.rl_module(algorithm_config_overrides_per_module={"agent_0":
+                maobs.JointConfig.overrides(exploration={"noise": 0.3})})`.
+            actor: "mlp" (default), "lstm" over the last `seq_length` observations (eq. 10), a subclass of `Actor`, or
+                where to import one from.
+            actor_settings: What the actor's constructor takes besides.
+            critic: "mlp" (default), a subclass of `Critic`, or where to import one from.
+            critic_settings: What the critic's constructor takes besides.
+            observation_layouts: What each agent's observation is made of, by agent: `{"agent_0": [("self", 1, 4),
+                ("target", 3, 2, 2)], ...}` (see `Entities`). None (default) takes what the environment says, or one
+                group if it says nothing.
+            state_layout: The same of the environment's own state; the agents come first.
+            seq_length: T, the window of a recurrent actor. Default 5 (table II).
+            stored_state: Whether a recurrent actor's window starts from the state with which the one a step earlier
+                ended, the initial one at an episode's start (eq. 10), instead of always from the initial one. Learning
+                starts from those of acting, stored in replay, as constants (Kapturowski et al. 2019). Default False.
             n_step: Steps of reward in a target before it bootstraps (Sutton 1988). Default 1.
             twin_critics: Whether every agent has two critics, whose minimum is the target's value (TD3, Fujimoto et
                 al. 2018; MATD3, Ackermann et al. 2019). Default False.
@@ -216,6 +243,8 @@ class JointConfig(AlgorithmConfig):
         Returns:
             This config.
         """
+        if "carry_hidden" in kwargs:
+            raise ValueError("carry_hidden is now called stored_state (Kapturowski et al. 2019's term).")
         super().training(**kwargs)
         given = {k: v for k, v in locals().items() if k not in ("self", "kwargs", "__class__")}
         for name, value in given.items():
@@ -230,69 +259,13 @@ class JointConfig(AlgorithmConfig):
         Raises:
             ValueError: If something is not legal; says what, and what would be.
         """
-        self._validate_numbers()
-        one_of("critic_state", self.critic_state, CRITIC_STATES)
-        one_of("actor", self.actor, ACTORS)
-        if self.carry_hidden and self.actor != "lstm":
-            raise ValueError(
-                f"carry_hidden=True needs h and c to carry: legal with actor='lstm', not with actor={self.actor!r}."
-            )
-        Exploration.from_dict({**self.default_exploration, **self.exploration})
-        settings = self.model_config
-        for name in settings:
-            if name not in _MODEL_SETTINGS:
-                raise ValueError(f"Unknown model_config setting {name!r}; legal are {', '.join(_MODEL_SETTINGS)}.")
-        one_of("model_config['activation']", settings["activation"], ACTIVATIONS)
-        hidden = settings["hidden_sizes"]
-        if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
-            raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
-        cell = settings["lstm_cell_size"]
-        if not isinstance(cell, int) or cell < 1:
-            raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 48, not {cell!r}.")
-        if self.num_learners > 0:
-            raise ValueError(
-                f"num_learners must be 0, not {self.num_learners}: a stacked update of all agents runs in the "
-                f"algorithm's process (on its GPU with num_gpus_per_learner=1). Scale out with num_env_runners "
-                f"or with more Tune trials."
-            )
-        if not issubclass(self.env_runner_cls or object, JointEnvRunner):
-            raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {self.env_runner_cls}: replay is joint.")
-        if not self.normalize_actions:
-            raise ValueError("normalize_actions must be True: the actors' actions are in [-1, 1].")
-        if not self.abilities.twin_critics and (self.twin_critics or self.target_noise or self.policy_delay > 1):
-            legal = "twin_critics=False, target_noise=0.0 and policy_delay=1"
-            raise ValueError(f"{self.name} is not defined with TD3's options; legal are {legal}.")
-        self._inspect_environment()
-        # RLlib would say, once, that its old API stack is a choice, too; here it is none.
-        log_once(f"{getattr(self.algo_class, '__name__', '')}_on_new_api_stack")
+        checks.check_settings_of(self)
+        checks.check_networks(self)
+        self.team = checks.inspect_team(self)
+        self.module_ids = checks.map_policies(self)
+        checks.check_team(self)
+        checks.check_layouts(self)
         super().validate()
-
-    def _validate_numbers(self) -> None:
-        for name in ("actor_lr", "critic_lr"):
-            if isinstance(getattr(self, name), int | float):
-                in_range(name, getattr(self, name), 0.0, open_low=True)
-        in_range("tau", self.tau, 0.0, 1.0, open_low=True)
-        in_range("gamma", self.gamma, 0.0, 1.0)
-        for name in ("train_batch_size_per_learner", "replay_buffer_capacity", "num_envs_per_env_runner"):
-            in_range(name, getattr(self, name), 1)
-        for name in ("seq_length", "n_step", "policy_delay"):
-            in_range(name, getattr(self, name), 1)
-            if not isinstance(getattr(self, name), int):
-                raise ValueError(f"{name} must be an integer, not {getattr(self, name)!r}.")
-        for name in ("updates_per_env_step", "target_noise", "target_noise_clip", "action_regularization"):
-            in_range(name, getattr(self, name), 0.0)
-        for name in ("gumbel_temperature", "reward_scale"):
-            in_range(name, getattr(self, name), 0.0, open_low=True)
-        if self.grad_clip is not None:
-            in_range("grad_clip", self.grad_clip, 0.0, open_low=True)
-        for name in ("num_random_steps", "num_steps_sampled_before_learning_starts"):
-            in_range(name, getattr(self, name), 0)
-        for name in ("train_batch_size_per_learner", "num_steps_sampled_before_learning_starts", "seq_length"):
-            if getattr(self, name) > self.replay_buffer_capacity:
-                raise ValueError(
-                    f"{name} ({getattr(self, name)}) must not be larger than "
-                    f"replay_buffer_capacity ({self.replay_buffer_capacity})."
-                )
 
     @override(AlgorithmConfig)
     def build_algo(self, env: Any = None, use_copy: bool = True) -> Any:
@@ -303,51 +276,32 @@ class JointConfig(AlgorithmConfig):
         self.copy(copy_frozen=False).validate()
         return super().build_algo(use_copy=use_copy)
 
-    def _inspect_environment(self) -> None:
-        """Makes one copy of the environment to learn its team, and names the policies after the agents."""
-        if self.env is None:
-            raise ValueError('No environment: set one with config.environment("maobs/spread-3a").')
-        env = make_env(self, num_envs=1)
-        try:
-            self.team = team = Team.of(env, with_state=self.uses_state and self.critic_state == "world")
-            if self.abilities.team_reward and not shares_reward(env):
-                raise ValueError(
-                    f"{self.name} learns the value of one team reward, but in {self.env} agents' rewards differ: give "
-                    f'all agents the same (option reward_mode="sum" of this package\'s environments), or use another '
-                    f"algorithm."
-                )
-        finally:
-            env.close()
-        kind = "discrete" if team.discrete else "continuous"
-        if kind not in self.abilities.actions:
-            raise ValueError(
-                f"{self.name} needs {self.abilities.actions[0]} actions, but those of {self.env} are {kind}: choose "
-                f'them in the environment (option action_mode="discrete" or "mpe" of this package\'s).'
-            )
-        different = len({*team.observation_sizes}) > 1 or len({*team.action_sizes}) > 1
-        if different and not self.abilities.different_agents:
-            raise ValueError(
-                f"{self.name} needs agents with observations and actions of equal size, but those of {self.env} have "
-                f"{dict(zip(team.agents, zip(team.observation_sizes, team.action_sizes, strict=True), strict=True))}."
-            )
-        if not self.is_multi_agent:
-            self.multi_agent(
-                policies={agent: PolicySpec() for agent in team.agents},
-                policy_mapping_fn=own_policy,
-            )
-        self.module_ids = tuple(self.policy_mapping_fn(agent, None) for agent in team.agents)
-        mapping = dict(zip(team.agents, self.module_ids, strict=True))
-        if set(self.module_ids) != set(self.policies):
-            raise ValueError(
-                f"The policy mapping must use every policy and no other: policies are {sorted(self.policies)}, agents "
-                f"are mapped to {mapping}."
-            )
-        for policy in self.policies:
-            spaces = {agent: team.spaces(agent) for agent, own in mapping.items() if own == policy}
-            if len({(obs.shape, getattr(act, "n", act.shape)) for obs, act in spaces.values()}) > 1:
-                raise ValueError(f"Agents that share policy {policy!r} must have spaces of equal size, not {spaces}.")
-        if self.policies_to_train is not None:
-            raise ValueError("policies_to_train must be None: all agents of the team are trained.")
+    # What follows from the settings.
+
+    @property
+    def central_critic(self) -> bool:
+        """Whether critics see the global state."""
+        return "state" in self.critic_sees
+
+    @property
+    def uses_state(self) -> bool:
+        """Whether the algorithm sees the global state when it learns."""
+        return self.central_critic or self.mixes
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether actors are recurrent."""
+        return issubclass(ACTORS.resolve(self.actor), RecurrentActor)
+
+    @property
+    def window_length(self) -> int:
+        """T of the windows that actors see; 0 if they see single observations."""
+        return self.seq_length if self.recurrent else 0
+
+    @property
+    def critics_are_told(self) -> bool:
+        """Whether centralised critics are told whose value they are to give."""
+        return self.central_critic and (self.agent_id_input or CRITICS.resolve(self.critic).asks_whose)
 
     @property
     def state_columns(self) -> list[int]:
@@ -357,22 +311,39 @@ class JointConfig(AlgorithmConfig):
         return [i * width + o for i, size in enumerate(self.team.observation_sizes) for o in range(start, size)]
 
     @property
-    def state_size(self) -> int:
-        """S, the width of what a centralised critic sees as the state."""
-        return self.team.state_size if self.critic_state == "world" else len(self.state_columns)
+    def state_groups(self) -> Layout:
+        """What the state that the algorithm sees is made of."""
+        if self.critic_state == "world":
+            assert self.team.state_layout is not None
+            return self.team.state_layout
+        return tuple(
+            group._replace(name=f"{agent}.{group.name}")
+            for agent, layout in zip(self.team.agents, self.team.observation_layouts, strict=True)
+            for group in (layout[1:] if self.agent_id_input else layout)
+        )
 
     @property
-    def hidden_size(self) -> int:
-        """H, the size of the h and c that are carried and stored; 0 if they are not."""
-        return self.model_config["lstm_cell_size"] if self.carry_hidden else 0
+    def state_size(self) -> int:
+        """S, the width of the state that the algorithm sees."""
+        return layout_size(self.state_groups)
 
-    def critic_sizes(self, agent: str) -> tuple[int, int] | None:
-        """Widths of what one agent's critic sees, of the state and of the actions; None if there are no critics."""
-        raise TypeError(f"{type(self).__name__} defines no critic_sizes: derive a config that does.")
+    def critic_layouts(self, agent: str) -> tuple[Layout, Layout] | None:
+        """What one agent's critic sees, of the state and of the actions; None if there are no critics."""
+        if not self.critic_sees:
+            return None
+        index, size = self.team.agents.index(agent), self.team.action_size
+        if not self.central_critic:
+            return self.team.observation_layouts[index], (Entities("self", 1, self.team.action_sizes[index]),)
+        state = self.state_groups
+        if "joint_action" not in self.critic_sees:
+            return state, (Entities("self", 1, size),)
+        return state, tuple(Entities(name, count, size) for name, count in checks.agent_groups(self, state))
 
     def mixer_settings(self) -> dict[str, Any] | None:
         """Settings of the `MixerModule`, or None if values are not mixed."""
         return None
+
+    # RLlib's side of it.
 
     @property
     @override(AlgorithmConfig)
@@ -380,32 +351,50 @@ class JointConfig(AlgorithmConfig):
         return {
             "hidden_sizes": (64, 64, 64),
             "activation": "relu",
-            "lstm_cell_size": 48,
-            "actor": self.actor,
+            "lstm_cell_size": 64,
+            "actor": ACTORS.reference(self.actor),
+            "actor_settings": self.actor_settings,
+            "critic": CRITICS.reference(self.critic),
+            "critic_settings": self.critic_settings,
             "seq_length": self.seq_length,
-            "carry_hidden": self.carry_hidden,
-            "exploration": {**self.default_exploration, **self.exploration},
+            "stored_state": self.stored_state,
             "normalize_observations": self.normalize_observations,
             "num_critics": 1 + self.twin_critics,
         }
 
+    def exploration_of(self, module_id: str) -> dict[str, Any]:
+        """One policy's settings of exploration."""
+        own = self.get_config_for_module(module_id).exploration
+        return own if "type" in own else {**self.default_exploration, **own}
+
     @override(AlgorithmConfig)
     def get_default_rl_module_spec(self) -> RLModuleSpec:
-        """One `AgentModule` per policy."""
-        return RLModuleSpec(module_class=AgentModule)
+        """One module per policy."""
+        return RLModuleSpec(module_class=self.module)
+
+    @override(AlgorithmConfig)
+    def get_default_learner_class(self) -> type[JointLearner]:
+        """The learner that the algorithm declares."""
+        return self.learner
 
     @override(AlgorithmConfig)
     def get_multi_rl_module_spec(self, **kwargs: Any) -> MultiRLModuleSpec:
-        """The agents' modules, each with the sizes of its critic's inputs, and the team's mixers for a learner."""
+        """The agents' modules, each with what its networks see, and the team's mixers for a learner."""
         spec: MultiRLModuleSpec = super().get_multi_rl_module_spec(**kwargs)
         for agent, mid in zip(self.team.agents, self.module_ids, strict=True):
-            if (sizes := self.critic_sizes(agent)) is not None:
-                state, actions = sizes
-                ids = len(self.team.agents) if self.agent_id_input and self.central_critic else 0
-                own = {"critic_state_size": state, "critic_action_size": actions + ids}
-                settings = spec.rl_module_specs[mid].model_config or {}
-                settings = settings if isinstance(settings, dict) else asdict(settings)
-                spec.rl_module_specs[mid].model_config = {**settings, **own}
+            index = self.team.agents.index(agent)
+            own: dict[str, Any] = {
+                "observation_layout": _plain(self.team.observation_layouts[index]),
+                "exploration": self.exploration_of(mid),
+            }
+            if (layouts := self.critic_layouts(agent)) is not None:
+                own |= {
+                    f"{part}_layout": _plain(groups) for part, groups in zip(("state", "action"), layouts, strict=True)
+                }
+                own["num_agents"] = len(self.team.agents) if self.critics_are_told else 0
+            settings = spec.rl_module_specs[mid].model_config or {}
+            settings = settings if isinstance(settings, dict) else asdict(settings)
+            spec.rl_module_specs[mid].model_config = {**own, **settings}
         mixing = self.mixer_settings()
         if mixing is not None and not kwargs.get("inference_only"):
             observation_space, action_space = self.team.spaces(self.team.agents[0])
@@ -423,3 +412,8 @@ class JointConfig(AlgorithmConfig):
         if self.rollout_fragment_length != "auto":
             return int(self.rollout_fragment_length)
         return 1 if self.num_env_runners == 0 else 16
+
+
+def _plain(layout: Layout) -> list[list[Any]]:
+    """A layout as checkpoints hold it."""
+    return [list(group) for group in layout]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
-from rllib_maobs.algorithms.config import Abilities, JointConfig, in_range, one_of
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import Params
-from rllib_maobs.terms import Batch, Nets
+from rllib_maobs.algorithms.config import JointConfig, Supports
+from rllib_maobs.learner import JointLearner, TeamNetworks
+from rllib_maobs.options import Range
+from rllib_maobs.replay import Batch, Moment
 
-CRITIC_SOURCES = ("shared", "others", "own")
 LOCAL = "local"  # the training stage before the mixer
 
 
@@ -22,51 +21,39 @@ class FACMACLearner(JointLearner):
     """Equations 7 to 9, and for the two stages of figure 7, 13 and 14."""
 
     @override(JointLearner)
-    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    def critic_loss(self, online: TeamNetworks, target: TeamNetworks, batch: Batch) -> tuple[Tensor, Tensor]:
         """Eq. 8: L(phi, psi) = E[(y - Q_tot)^2], y = r + gamma Q'_tot(tau', mu'(tau'), s').
 
         Before `mixer_start`: IDDPG's, every local critic with a target of its own.
         """
-        next_actions = self.next_actions(target.actor, batch)  # (B, N, A)
-        next_q = self.local_q(target.critic, self.local_encode(target.critic, batch.next_obs), next_actions)
-        encoded = self.local_encode(nets.critic, batch.obs)
-        q = self.local_q(nets.critic, encoded, batch.actions)  # (B, N) or (B, N, N)
+        next_actions = target.next_actions(batch)  # (B, N, A)
         if self.stage == LOCAL:
-            y = batch.rewards + batch.discount * self.of_itself(next_q)  # (B, N)
-            return (y - self.of_itself(q)).square().mean(0), self.of_itself(q), encoded  # (N,)
-        y = batch.rewards[:, :1] + batch.discount * self.mix(target.mixer, next_q, batch.next_state)  # (B, M)
-        q_tot = self.mix(nets.mixer, q, batch.state)  # (B, M)
-        return (y - q_tot).square().mean(0), q_tot, encoded  # (M,)
+            y = (batch.rewards + batch.discount * target.q(batch.next, next_actions)[..., 0]).detach()  # (B, N)
+            q = online.q(batch.now, batch.actions)[..., 0]  # (B, N)
+        else:
+            next_q = self.total(target, batch.next, next_actions)  # (B, M)
+            y = (batch.rewards[:, :1] + batch.discount * next_q).detach()  # (B, M)
+            q = self.total(online, batch.now, batch.actions)  # (B, M)
+        return (y - q).square().mean(0), q
 
     @override(JointLearner)
-    def actor_loss(self, actions: Tensor, nets: Nets, encoded: Tensor, batch: Batch) -> Tensor:
+    def actor_loss(self, actions: Tensor, online: TeamNetworks, batch: Batch) -> Tensor:
         """Eq. 9 and 14: grad J(mu) = E[grad mu grad_mu Q_tot(tau, mu_1(tau_1)..mu_N(tau_N), s)], as a loss.
 
         Before `mixer_start`, eq. 13: grad J(mu_a) = E[grad mu_a grad_u Q_a(o_a, u) at u = mu_a(o_a)].
         """
-        if self.config.critic_source == "own":
-            # Q_tot^a is of agent a alone: all current actions are in it, the gradient goes to a's.
-            actions = self.own_actions(actions, actions.detach())  # (B, N, N, A)
-        q = self.local_q(nets.critic, encoded, actions)
         if self.stage == LOCAL:
-            return -self.of_itself(q).mean(0)  # (N,)
-        return -self.mix(nets.mixer, q, batch.state).mean(0)  # (M,)
+            return -online.q(batch.now, actions)[..., 0].mean(0)  # (N,)
+        return -self.total(online, batch.now, actions, others=actions.detach()).mean(0)  # (M,)
 
-    def local_encode(self, critic: Params, obs: Tensor) -> Tensor:
-        """What the local critics see of the observations: `(B, N, H)`, or of every critic on each `(B, N, N, H)`."""
+    def total(self, nets: TeamNetworks, moment: Moment, actions: Tensor, *, others: Tensor | None = None) -> Tensor:
+        """Eq. 7: Q_tot = g_psi(s, Q_1(o_1, u_1)..Q_N(o_N, u_N)), of the team `(B, 1)`, or each agent's own `(B, N)`.
+
+        Q_tot^a of `critic_source="own"` is agent a's alone: it sees the `others`' actions where they are given.
+        """
         if self.config.critic_source == "own":
-            return self.critics(critic, (obs, None), method="encode")
-        return self.encode(critic, obs)
-
-    def local_q(self, critic: Params, encoded: Tensor, actions: Tensor) -> Tensor:
-        """Q_j(o_j, u_j), `(B, N)`; with `critic_source="own"` Q_a(o_j, u_j) of every critic a, `(B, N, N)`."""
-        dim = None if self.config.critic_source == "own" and actions.dim() == 3 else 1
-        return self.critics(critic, (encoded, 1), (actions, dim), method="value").squeeze(-1)
-
-    @staticmethod
-    def of_itself(q: Tensor) -> Tensor:
-        """Every critic's value of its own agent, `(B, N)`."""
-        return q if q.dim() == 2 else q.diagonal(dim1=1, dim2=2)
+            return nets.mix_each(nets.cross_q(moment, actions, others=others)[..., 0], moment)
+        return nets.mix(nets.q(moment, actions)[..., 0], moment)
 
     @property
     @override(JointLearner)
@@ -100,11 +87,19 @@ class FACMACConfig(JointConfig):
     """
 
     name = "facmac"
-    abilities = Abilities(team_reward=True, twin_critics=False)
-    central_critic = False
+    supports = Supports(team_reward=True, twin_critics=False)
+    critic_sees = ("observation", "action")
+    mixes = True
+    learner = FACMACLearner
+    legal: ClassVar[dict[str, Any]] = {
+        **JointConfig.legal,
+        "critic_source": Literal["shared", "others", "own"],
+        "mixer_start": Annotated[int, Range(0)],
+        "mixer_hidden_size": Annotated[int, Range(1)],
+    }
 
     def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or FACMAC)
+        super().__init__(algo_class=algo_class)
         self.critic_source: Literal["shared", "others", "own"] = "shared"
         self.mixer_start = 0
         self.mixer_hidden_size = 32
@@ -136,14 +131,11 @@ class FACMACConfig(JointConfig):
     @override(JointConfig)
     def validate(self) -> None:
         """Raises ValueError for settings that are not legal."""
-        one_of("critic_source", self.critic_source, CRITIC_SOURCES)
-        in_range("mixer_start", self.mixer_start, 0)
-        in_range("mixer_hidden_size", self.mixer_hidden_size, 1)
         super().validate()
-        sizes = set(zip(self.team.observation_sizes, self.team.action_sizes, strict=True))
-        if len(sizes) > 1 and self.critic_source != "others":
+        layouts = set(zip(self.team.observation_layouts, self.team.action_sizes, strict=True))
+        if len(layouts) > 1 and self.critic_source != "others":
             raise ValueError(
-                f"critic_source must be 'others' where agents' observations or actions differ in size, not "
+                f"critic_source must be 'others' where agents' observations or actions differ, not "
                 f"{self.critic_source!r}: one critic cannot judge them all."
             )
 
@@ -151,12 +143,6 @@ class FACMACConfig(JointConfig):
     def ties_critics(self) -> bool:  # type: ignore[override]
         """Whether all agents have the same critic."""
         return self.critic_source == "shared"
-
-    @override(JointConfig)
-    def critic_sizes(self, agent: str) -> tuple[int, int]:
-        """(O, A) of the agent."""
-        index = self.team.agents.index(agent)
-        return self.team.observation_sizes[index], self.team.action_sizes[index]
 
     @override(JointConfig)
     def mixer_settings(self) -> dict[str, Any]:
@@ -170,17 +156,8 @@ class FACMACConfig(JointConfig):
             "monotone": False,
         }
 
-    @override(JointConfig)
-    def get_default_learner_class(self) -> type[JointLearner]:
-        """Eq. 7 to 9, 13 and 14."""
-        return FACMACLearner
-
 
 class FACMAC(JointAlgorithm):
     """FACMAC, see `FACMACConfig`."""
 
-    @classmethod
-    @override(JointAlgorithm)
-    def get_default_config(cls) -> FACMACConfig:
-        """The original's critic, the paper's other settings."""
-        return FACMACConfig()
+    config_class = FACMACConfig

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 from ray.rllib.algorithms.algorithm_config import NotProvided
-from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
-from rllib_maobs.algorithms.config import Abilities, JointConfig
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import Params, Stack, UtilityModule
-from rllib_maobs.terms import Batch, Nets
+from rllib_maobs.algorithms.config import JointConfig, Supports
+from rllib_maobs.learner import CRITIC, JointLearner, Parts, TeamNetworks
+from rllib_maobs.modules import UtilityModule
+from rllib_maobs.modules.team import Actors
+from rllib_maobs.replay import Batch, Moment
 
 
 class QLearner(JointLearner):
@@ -22,42 +23,37 @@ class QLearner(JointLearner):
     has_actors = False
 
     @override(JointLearner)
-    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, tuple[()]]:
+    def critic_loss(self, online: TeamNetworks, target: TeamNetworks, batch: Batch) -> tuple[Tensor, Tensor]:
         """L = E[(y - Q)^2], y = r + gamma Q'(u*'), with Q mixed and u*_a' = argmax Q'_a (or Q_a with `double_q`)."""
-        q = (self.utilities(nets.critic, batch.history) * batch.actions).sum(-1)  # (B, N)
-        next_q = self.utilities(target.critic, batch.next_history)  # (B, N, A)
-        judge = self.utilities(nets.critic, batch.next_history).detach() if self.config.double_q else next_q
-        best = self.legal(judge).argmax(-1, keepdim=True)  # (B, N, 1)
+        q = (online.outputs(batch.now) * batch.actions).sum(-1)  # (B, N)
+        next_q = target.outputs(batch.next)  # (B, N, A)
+        judge = online.outputs(batch.next).detach() if self.config.double_q else next_q
+        best = target.legal(judge).argmax(-1, keepdim=True)  # (B, N, 1)
         next_q = next_q.gather(-1, best).squeeze(-1)  # (B, N)
-        q_tot, next_q_tot = self.total(nets.mixer, q, batch.state), self.total(target.mixer, next_q, batch.next_state)
-        y = batch.rewards[:, : q_tot.shape[1]] + batch.discount * next_q_tot  # (B, N) or (B, 1)
-        return (y - q_tot).square().mean(0), q_tot, ()
+        total, next_total = self.total(online, q, batch.now), self.total(target, next_q, batch.next)
+        y = (batch.rewards[:, : total.shape[1]] + batch.discount * next_total).detach()  # (B, N) or (B, 1)
+        return (y - total).square().mean(0), total
 
-    def total(self, mixer: Params, q: Tensor, state: Tensor) -> Tensor:
+    def total(self, nets: TeamNetworks, q: Tensor, moment: Moment) -> Tensor:
         """What is learned from all agents' values `(B, N)`: here every agent's own, `(B, N)`."""
         return q
 
-    def utilities(self, utility: Params, history: tuple[Tensor, ...]) -> Tensor:
-        """Every agent's Q_a of each of its actions, `(B, N, A)`."""
-        dims = (1, None, 1)[: len(history)]
-        return self._roles["critic"](utility, *zip(history, dims, strict=True))
-
-    def legal(self, values: Tensor) -> Tensor:
-        """Values `(B, N, A)` with -inf for actions that an agent has not."""
-        return values if self._action_mask is None else values.masked_fill(~self._action_mask, -float("inf"))
-
-    @property
     @override(JointLearner)
-    def acting(self) -> Stack:
-        """The utilities."""
-        return self._roles["critic"]
-
-    @override(JointLearner)
-    def stacks(self, modules: list[Any]) -> tuple[dict[str, Stack], dict[str, Stack]]:
+    def stacks(
+        self, modules: Sequence[Any], prefix: str, action_mask: Tensor | None, agent_ids: Tensor | None
+    ) -> Parts:
         """The utilities, and the mixer if there is one."""
-        online = {"critic": Stack([m.utility for m in modules])}
-        target = {"critic": Stack([m.target_utility for m in modules])}
-        return online | self.mixer_stack(), target | self.mixer_stack("target_")
+        networks = [getattr(m, f"{prefix}utility") for m in modules]
+        names = [f"the utility of {agent}" for agent in self.config.team.agents]
+        return Parts(
+            config=self.config,
+            actors=Actors(networks, names),
+            acting_role=CRITIC,  # utilities act, and are learned as critics are
+            critics=None,
+            mixers=self.mixers(prefix),
+            action_mask=action_mask,
+            agent_ids=None,
+        )
 
 
 class IQLConfig(JointConfig):
@@ -73,13 +69,15 @@ class IQLConfig(JointConfig):
     """
 
     name = "iql"
-    abilities = Abilities(actions=("discrete",), twin_critics=False)
-    uses_state = False
-    central_critic = False
-    default_exploration: ClassVar[dict[str, float]] = {"epsilon": 1.0, "noise": 0.0, "decay": 1.9e-5, "final": 0.05}
+    supports = Supports(actions=("discrete",), twin_critics=False)
+    critic_sees = ()
+    learner = QLearner
+    module = UtilityModule
+    default_exploration: ClassVar[dict[str, Any]] = {"epsilon": 1.0, "noise": 0.0, "decay": 1.9e-5, "final": 0.05}
+    legal: ClassVar[dict[str, Any]] = {**JointConfig.legal, "double_q": bool}
 
     def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or IQL)
+        super().__init__(algo_class=algo_class)
         self.double_q = False
         self.critic_lr = 1e-3
 
@@ -97,26 +95,8 @@ class IQLConfig(JointConfig):
             self.double_q = double_q
         return self
 
-    @override(JointConfig)
-    def critic_sizes(self, agent: str) -> None:
-        """No critics: utilities act."""
-
-    @override(JointConfig)
-    def get_default_rl_module_spec(self) -> RLModuleSpec:
-        """One `UtilityModule` per policy."""
-        return RLModuleSpec(module_class=UtilityModule)
-
-    @override(JointConfig)
-    def get_default_learner_class(self) -> type[JointLearner]:
-        """Q-learning, every agent on its own."""
-        return QLearner
-
 
 class IQL(JointAlgorithm):
     """IQL, see `IQLConfig`."""
 
-    @classmethod
-    @override(JointAlgorithm)
-    def get_default_config(cls) -> IQLConfig:
-        """PyMARL's exploration."""
-        return IQLConfig()
+    config_class = IQLConfig

@@ -7,27 +7,25 @@ from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
 from rllib_maobs.algorithms.config import JointConfig
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.terms import Batch, Nets
+from rllib_maobs.learner import JointLearner, TeamNetworks, squared_error
+from rllib_maobs.replay import Batch
 
 
 class MADDPGLLearner(JointLearner):
     """Equations 11 and 12."""
 
     @override(JointLearner)
-    def critic_loss(self, nets: Nets, target: Nets, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    def critic_loss(self, online: TeamNetworks, target: TeamNetworks, batch: Batch) -> tuple[Tensor, Tensor]:
         """Eq. 11: L(phi_a) = E[(y_a - Q_a(s, u_a))^2], y_a = r_a + gamma Q'_a(s', mu'_a(o'_a))."""
-        next_actions = self.next_actions(target.actor, batch)  # (B, N, A)
-        next_q = self.q(target.critic, self.encode(target.critic, batch.next_state), next_actions).amin(-1)  # (B, N)
-        y = batch.rewards + batch.discount * next_q  # (B, N)
-        encoded = self.encode(nets.critic, batch.state)  # (B, N, H)
-        q = self.q(nets.critic, encoded, batch.actions)  # (B, N, C)
-        return self.squared_error(y, q), q[..., 0], encoded
+        next_q = target.q(batch.next, target.next_actions(batch)).amin(-1)  # (B, N)
+        y = (batch.rewards + batch.discount * next_q).detach()  # (B, N)
+        q = online.q(batch.now, batch.actions)  # (B, N, C)
+        return squared_error(y, q), q[..., 0]
 
     @override(JointLearner)
-    def actor_loss(self, actions: Tensor, nets: Nets, encoded: Tensor, batch: Batch) -> Tensor:
+    def actor_loss(self, actions: Tensor, online: TeamNetworks, batch: Batch) -> Tensor:
         """Eq. 12: grad J(mu_a) = E[grad mu_a(o_a) grad_u Q_a(s, u) at u = mu_a(o_a)], as a loss."""
-        return -self.q(nets.critic, encoded, actions)[..., 0].mean(0)  # (N,)
+        return -online.q(batch.now, actions)[..., 0].mean(0)  # (N,)
 
 
 class MADDPGLConfig(JointConfig):
@@ -45,26 +43,11 @@ class MADDPGLConfig(JointConfig):
     """
 
     name = "maddpg-l"
-
-    def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or MADDPGL)
-
-    @override(JointConfig)
-    def critic_sizes(self, agent: str) -> tuple[int, int]:
-        """(S, A)."""
-        return self.state_size, self.team.action_size
-
-    @override(JointConfig)
-    def get_default_learner_class(self) -> type[JointLearner]:
-        """Eq. 11 and 12."""
-        return MADDPGLLearner
+    critic_sees = ("state", "action")
+    learner = MADDPGLLearner
 
 
 class MADDPGL(JointAlgorithm):
     """MADDPG-L, see `MADDPGLConfig`."""
 
-    @classmethod
-    @override(JointAlgorithm)
-    def get_default_config(cls) -> MADDPGLConfig:
-        """The paper's settings."""
-        return MADDPGLConfig()
+    config_class = MADDPGLConfig

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from ray.rllib.utils.annotations import override
-
 from rllib_maobs.algorithms.maddpg import MADDPG, MADDPGConfig
 
 
@@ -20,9 +18,9 @@ class MADDPGLSTMConfig(MADDPGConfig):
     starts every window from zero h and c, when it acts and when it learns alike. Windows never cross a reset,
     and one at an episode's start is as long as the episode so far. Critics and both losses are MADDPG's (eq. 2
     and 3); the target actors' windows end one step later. Any algorithm here takes `actor="lstm"`. The paper does not
-    give the LSTM's size: it is `lstm_cell_size`, 48 units unless `rl_module(model_config={...})` says otherwise.
+    give the LSTM's size: it is `lstm_cell_size`, 64 units unless `rl_module(model_config={...})` says otherwise.
 
-    With `carry_hidden=True` it is eq. 10 to the letter, u_a = mu_a({o_a^(t-i)}, h^(t-1), c^(t-1)): the window at step t
+    With `stored_state=True` it is eq. 10 to the letter, u_a = mu_a({o_a^(t-i)}, h^(t-1), c^(t-1)): the window at step t
     starts from the h and c with which the one at t-1 ended, which learning takes from replay as acting had them. They
     have seen all but the newest of its observations before; with `seq_length=1` each is seen once.
     """
@@ -30,15 +28,11 @@ class MADDPGLSTMConfig(MADDPGConfig):
     name = "maddpg-lstm"
 
     def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or MADDPGLSTM)
+        super().__init__(algo_class=algo_class)
         self.actor = "lstm"
 
 
 class MADDPGLSTM(MADDPG):
     """MADDPG-LSTMactor, see `MADDPGLSTMConfig`."""
 
-    @classmethod
-    @override(MADDPG)
-    def get_default_config(cls) -> MADDPGLSTMConfig:
-        """The paper's settings."""
-        return MADDPGLSTMConfig()
+    config_class = MADDPGLSTMConfig

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from ray.rllib.algorithms.algorithm_config import NotProvided
 from ray.rllib.utils.annotations import override
 from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
-from rllib_maobs.algorithms.config import Abilities, in_range
+from rllib_maobs.algorithms.config import Supports
 from rllib_maobs.algorithms.iql import IQLConfig, QLearner
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import Params
+from rllib_maobs.learner import TeamNetworks
+from rllib_maobs.options import Range
+from rllib_maobs.replay import Moment
 
 
 class QMIXLearner(QLearner):
     """Equations 5 and 6."""
 
     @override(QLearner)
-    def total(self, mixer: Params, q: Tensor, state: Tensor) -> Tensor:
+    def total(self, nets: TeamNetworks, q: Tensor, moment: Moment) -> Tensor:
         """Eq. 5: Q_tot(tau, u, s) = f_psi(s, Q_1(tau_1, u_1)..Q_N(tau_N, u_N)), f monotone; its loss is eq. 6."""
-        return self.mix(mixer, q, state)  # (B, 1)
+        return nets.mix(q, moment)  # (B, 1)
 
 
 class QMIXConfig(IQLConfig):
@@ -35,11 +36,13 @@ class QMIXConfig(IQLConfig):
     """
 
     name = "qmix"
-    abilities = Abilities(actions=("discrete",), team_reward=True, twin_critics=False)
-    uses_state = True
+    supports = Supports(actions=("discrete",), team_reward=True, twin_critics=False)
+    mixes = True
+    learner = QMIXLearner
+    legal: ClassVar[dict[str, Any]] = {**IQLConfig.legal, "mixer_hidden_size": Annotated[int, Range(1)]}
 
     def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or QMIX)
+        super().__init__(algo_class=algo_class)
         self.mixer_hidden_size = 32
 
     @override(IQLConfig)
@@ -56,12 +59,6 @@ class QMIXConfig(IQLConfig):
         return self
 
     @override(IQLConfig)
-    def validate(self) -> None:
-        """Raises ValueError for settings that are not legal."""
-        in_range("mixer_hidden_size", self.mixer_hidden_size, 1)
-        super().validate()
-
-    @override(IQLConfig)
     def mixer_settings(self) -> dict[str, Any]:
         """One monotone mixer for the team."""
         return {
@@ -72,17 +69,8 @@ class QMIXConfig(IQLConfig):
             "monotone": True,
         }
 
-    @override(IQLConfig)
-    def get_default_learner_class(self) -> type[JointLearner]:
-        """Eq. 5 and 6."""
-        return QMIXLearner
-
 
 class QMIX(JointAlgorithm):
     """QMIX, see `QMIXConfig`."""
 
-    @classmethod
-    @override(JointAlgorithm)
-    def get_default_config(cls) -> QMIXConfig:
-        """PyMARL's exploration."""
-        return QMIXConfig()
+    config_class = QMIXConfig

@@ -6,17 +6,17 @@ from ray.rllib.utils.annotations import override
 from torch import Tensor
 
 from rllib_maobs.algorithms.base import JointAlgorithm
-from rllib_maobs.algorithms.config import Abilities
+from rllib_maobs.algorithms.config import Supports
 from rllib_maobs.algorithms.iql import IQLConfig, QLearner
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.modules import Params
+from rllib_maobs.learner import TeamNetworks
+from rllib_maobs.replay import Moment
 
 
 class VDNLearner(QLearner):
     """Equation 4."""
 
     @override(QLearner)
-    def total(self, mixer: Params, q: Tensor, state: Tensor) -> Tensor:
+    def total(self, nets: TeamNetworks, q: Tensor, moment: Moment) -> Tensor:
         """Eq. 4: Q_tot(tau, u) = sum_a Q_a(tau_a, u_a)."""
         return q.sum(-1, keepdim=True)  # (B, 1)
 
@@ -32,22 +32,11 @@ class VDNConfig(IQLConfig):
     """
 
     name = "vdn"
-    abilities = Abilities(actions=("discrete",), team_reward=True, twin_critics=False)
-
-    def __init__(self, algo_class: type | None = None) -> None:
-        super().__init__(algo_class=algo_class or VDN)
-
-    @override(IQLConfig)
-    def get_default_learner_class(self) -> type[JointLearner]:
-        """Eq. 4."""
-        return VDNLearner
+    supports = Supports(actions=("discrete",), team_reward=True, twin_critics=False)
+    learner = VDNLearner
 
 
 class VDN(JointAlgorithm):
     """VDN, see `VDNConfig`."""
 
-    @classmethod
-    @override(JointAlgorithm)
-    def get_default_config(cls) -> VDNConfig:
-        """PyMARL's exploration."""
-        return VDNConfig()
+    config_class = VDNConfig

@@ -1,6 +1,5 @@
 """An experiment as one command: algorithms x seeds as trials of Ray Tune, with a report at the end."""
 
-import json
 import logging
 import os
 import shlex
@@ -22,6 +21,7 @@ from rllib_maobs.experiment.arguments import PAPER_HORIZON, has_started, make_pa
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import FILES, STEPS, write_report
+from rllib_maobs.experiment.resume import forget_decisions
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
 
@@ -129,7 +129,7 @@ class Experiment:
             args.results_dir.mkdir(parents=True, exist_ok=True)
             if args.resume:
                 print(f"Resuming {self.name} in {args.results_dir}", flush=True)
-                _forget_decisions(args.results_dir)
+                forget_decisions(args.results_dir)
                 tuner = tune.Tuner.restore(str(args.results_dir), trainable=Trial, resume_errored=True)
             else:
                 self._print_plan(args, specs)
@@ -237,20 +237,6 @@ def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tune
             verbose=1,
         ),
     )
-
-
-def _forget_decisions(results_dir: Path) -> None:
-    """Take out of Tune's saved state what it still meant to do with trials when it ended.
-
-    For a trial that dies while it writes a checkpoint, Tune notes that it is to be stopped after the checkpoint. The
-    note outlives the run: resumed, the trial would be stopped after its next checkpoint, as if it had finished.
-    """
-    for path in results_dir.glob("experiment_state-*.json"):
-        state = json.loads(path.read_text())
-        state["runner_data"]["_cached_trial_decisions"] = {}
-        changed = path.with_suffix(".new")
-        changed.write_text(json.dumps(state, indent=2))
-        changed.replace(path)
 
 
 def _trial_name(trial: Any) -> str:

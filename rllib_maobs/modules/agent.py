@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
@@ -13,12 +14,34 @@ from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
 from ray.rllib.utils.annotations import override
 from torch import Tensor, nn
 
-from rllib_maobs.modules.exploration import Exploration
-from rllib_maobs.modules.networks import ACTORS, Critic, LSTMActor, MLPActor
+from rllib_maobs.layout import Layout, as_layout, flat
+from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor
+from rllib_maobs.modules.critics import CRITICS, Critic
+from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.modules.normalizer import Normalizer
+from rllib_maobs.registry import check_settings, settings_of
+
+# What RLlib's model_config calls settings that networks of several kinds take.
+COMMON_SETTINGS = {"hidden_sizes": "hidden_sizes", "activation": "activation", "lstm_cell_size": "cell_size"}
+ACTOR_ARGUMENTS = ("layout", "num_outputs")
+CRITIC_ARGUMENTS = ("state_layout", "action_layout", "num_critics", "num_agents")
 
 
-def push(window: Tensor, mask: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+class Seen(NamedTuple):
+    """What actors act on: observations, or for recurrent actors windows of them.
+
+    Attributes:
+        obs: `(..., O)`, or windows `(..., T, O)`, oldest first.
+        mask: Which of a window's observations count, `(B, T)`; None for all, or without windows.
+        recurrent_state: From which windows start, `(..., *H)`; None for the initial one.
+    """
+
+    obs: Tensor
+    mask: Tensor | None = None
+    recurrent_state: Tensor | None = None
+
+
+def append(window: Tensor, mask: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
     """Appends an observation to windows, whose oldest one drops out.
 
     Args:
@@ -31,6 +54,27 @@ def push(window: Tensor, mask: Tensor, observation: Tensor) -> tuple[Tensor, Ten
     """
     window = torch.cat([window[:, 1:], observation.unsqueeze(1)], dim=1)
     return window, torch.cat([mask[:, 1:], torch.ones_like(mask[:, :1])], dim=1)
+
+
+def network_settings(
+    cls: type[Any], model_config: Mapping[str, Any], own: Mapping[str, Any], reserved: Collection[str]
+) -> dict[str, Any]:
+    """A network's settings: those of RLlib's `model_config` that it takes, and its own, which come first.
+
+    Args:
+        cls: The network's class.
+        model_config: With `hidden_sizes`, `activation`, `lstm_cell_size`.
+        own: `actor_settings` or `critic_settings`.
+        reserved: Parameters of its constructor that are not settings.
+
+    Raises:
+        ValueError: For one that it does not take; names the legal ones.
+    """
+    takes = settings_of(cls, reserved)
+    common = {own: model_config[name] for name, own in COMMON_SETTINGS.items() if name in model_config and own in takes}
+    settings = {**common, **own}
+    check_settings(cls, settings, reserved)
+    return settings
 
 
 class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
@@ -47,9 +91,9 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     takes is the unsquashed one: `low + (action + 1) / 2 * (high - low)`. With a Discrete action space they are
     the actions' numbers, `(B,)`.
 
-    An LSTM actor is stateful: its state is the window of the last T observations, with `carry_hidden` also the h and c
-    with which the last window ended and the next one starts. Start every episode with `get_initial_state()` (batched),
-    and give each call the state that the one before returned:
+    A recurrent actor is stateful: its state is the window of the last T observations, with `stored_state` also the
+    state with which the last window ended and the next one starts. Start every episode with `get_initial_state()`
+    (batched), and give each call the state that the one before returned:
 
     ```python
     state = {name: value[None] for name, value in module.get_initial_state().items()}
@@ -57,49 +101,53 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     state = out["state_out"]
     ```
 
-    Settings (`model_config`): `hidden_sizes`, `activation`, `actor` ("mlp" or "lstm"), `lstm_cell_size` (H),
-    `seq_length` (T), `carry_hidden`, `exploration` (see `Exploration`), `normalize_observations`, and
-    `critic_state_size`, `critic_action_size`, `num_critics`: the widths of what the algorithm's critic sees and how
-    many there are of it. Without the critic's sizes the module has no critic: enough for acting.
+    Settings (`model_config`, plain values): `actor`, `critic` (names of `ACTORS` and `CRITICS`, or where to import the
+    class from) with `actor_settings`, `critic_settings`; `hidden_sizes`, `activation`, `lstm_cell_size` for networks
+    that take them; `observation_layout`, `state_layout`, `action_layout` (what the networks see), `num_critics`,
+    `num_agents` (see `Critic`); `seq_length` (T), `stored_state`, `exploration`, `normalize_observations`. Without the
+    critic's layouts the module has no critic: enough for acting.
     """
 
-    actor: MLPActor | LSTMActor
+    actor: Actor
     critic: Critic
     target_actor: nn.Module
     target_critic: nn.Module
     # Whether exploring with discrete actions draws from the softmax of the outputs (else it takes their maximum).
-    _samples = True
+    draws = True
 
     @override(TorchRLModule)
     def setup(self) -> None:
         """Builds the networks from the spaces and `model_config`."""
         self.actor = self._acting_network()
-        settings: dict[str, Any] = self.model_config
-        if "critic_state_size" in settings and not self.inference_only:
-            shape = {k: settings[k] for k in ("hidden_sizes", "activation", "num_critics") if k in settings}
-            self.critic = Critic(settings["critic_state_size"], settings["critic_action_size"], **shape)
+        settings = self.model_config
+        state, action = (_critic_layout(settings, part) for part in ("state", "action"))
+        if state and action and not self.inference_only:
+            cls = CRITICS.resolve(settings.get("critic", "mlp"))
+            own = network_settings(cls, settings, settings.get("critic_settings", {}), CRITIC_ARGUMENTS)
+            self.critic = cls(state, action, settings.get("num_critics", 1), settings.get("num_agents", 0), **own)
             self.make_target_networks()
 
-    def _acting_network(self) -> MLPActor | LSTMActor:
-        """A network from observations to actions, or to values of discrete actions, and what belongs to its use."""
+    def _acting_network(self) -> Actor:
+        """The network from observations to raw outputs, and what belongs to its use."""
         settings: dict[str, Any] = self.model_config
         assert isinstance(self.observation_space, gym.spaces.Box)
         size = self.observation_space.shape[0]
+        layout = as_layout(settings.get("observation_layout") or flat(size, "observation"), size, "observation")
         normalize = settings.get("normalize_observations", False)
         self.normalizer: nn.Module = Normalizer(size) if normalize else nn.Identity()
-        self.exploration = Exploration.from_dict(settings.get("exploration", {}))
         self.discrete = isinstance(self.action_space, gym.spaces.Discrete)
-        actor = settings.get("actor", "mlp")
-        self.seq_length: int = settings.get("seq_length", 1) if actor == "lstm" else 0
-        self.carries = actor == "lstm" and settings.get("carry_hidden", False)
-        shape: dict[str, Any] = {k: settings[k] for k in ("hidden_sizes", "activation") if k in settings}
-        if actor == "lstm":
-            shape["cell_size"] = settings.get("lstm_cell_size")
-        outputs = int(self.action_space.n) if self.discrete else self.action_space.shape[0]
-        return ACTORS[actor](size, outputs, **shape, discrete=self.discrete)
+        self.exploration = make_exploration(settings.get("exploration", {}), discrete=self.discrete)
+        cls = ACTORS.resolve(settings.get("actor", "mlp"))
+        own = network_settings(cls, settings, settings.get("actor_settings", {}), ACTOR_ARGUMENTS)
+        actor = cls(layout, int(self.action_space.n) if self.discrete else self.action_space.shape[0], **own)
+        self.recurrent = isinstance(actor, RecurrentActor)
+        # T, the length of the windows that the actor sees; 0 without windows.
+        self.seq_length: int = settings.get("seq_length", 1) if self.recurrent else 0
+        self.stored_state: bool = self.recurrent and settings.get("stored_state", False)
+        return actor
 
     @property
-    def acting(self) -> MLPActor | LSTMActor:
+    def acting(self) -> Actor:
         """The network that acts."""
         return self.actor
 
@@ -126,57 +174,59 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     @override(TorchRLModule)
     def get_initial_state(self) -> dict[str, Tensor]:
-        """An empty window `(T, O)`, its mask `(T,)`, and `(H,)` h and c if carried; nothing but for an LSTM."""
-        if not self.seq_length:
+        """An empty window `(T, O)`, its mask `(T,)`, with `stored_state` the actor's `(*H)`; else nothing."""
+        if not self.recurrent:
             return {}
         size = self.observation_space.shape[0]
         state = {"window": torch.zeros(self.seq_length, size), "mask": torch.zeros(self.seq_length)}
-        if self.carries:
-            assert isinstance(self.acting, LSTMActor)
-            state |= {name: torch.zeros(self.acting.from_hidden.in_features) for name in ("hidden", "cell")}
+        acting = self.acting
+        if self.stored_state and isinstance(acting, RecurrentActor):
+            state["recurrent_state"] = acting.initial_state()
         return state
 
-    def greedy(self, output: Tensor) -> Tensor:
-        """The actions of the network's outputs `(..., A)`: those outputs or, if discrete, the best one's number."""
-        return output.argmax(-1) if self.discrete else output
+    def greedy(self, outputs: Tensor) -> Tensor:
+        """The policy's own actions: tanh of raw outputs `(..., A)`, or if discrete the best one's number `(...)`."""
+        return outputs.argmax(-1) if self.discrete else torch.tanh(outputs)
 
-    def explore(self, output: Tensor, t: int, generator: torch.Generator | None = None) -> Tensor:
-        """Actions that explore around the network's outputs `(..., A)` after t env steps."""
+    def explore(self, outputs: Tensor, t: int, generator: torch.Generator | None = None) -> Tensor:
+        """Actions that explore around those of raw outputs `(..., A)` after t env steps."""
         if self.discrete:
-            return self.exploration.discrete(output, t, generator, sample=self._samples)
-        return self.exploration(output, t, generator)
+            return self.exploration.discrete(outputs, t, generator, sample=self.draws)
+        return self.exploration(self.greedy(outputs), t, generator)
 
     def _act(self, batch: dict[str, Any], network: nn.Module, t: int | None = None) -> dict[str, Any]:
         """Acts with a network: greedily, or exploring after t env steps."""
         obs = torch.as_tensor(batch[Columns.OBS], dtype=torch.float32)
-        if not self.seq_length:
-            outputs, state = network(self.normalizer(obs)), None
+        if self.recurrent:
+            outputs, state = self._along(obs, batch.get(Columns.STATE_IN), network)
         else:
-            if not batch.get(Columns.STATE_IN):
-                raise ValueError(
-                    "This agent's actor is an LSTM over a window of observations: give its state as "
-                    'batch["state_in"], get_initial_state() with a batch dimension at an episode\'s start and '
-                    'the last call\'s "state_out" after that.'
-                )
-            window, mask, *carried = (
-                torch.as_tensor(batch[Columns.STATE_IN][k], dtype=torch.float32) for k in self.get_initial_state()
-            )
-            hidden = torch.stack(carried, -2) if carried else None
-            steps = []
-            for now in obs.unsqueeze(1).unbind(1) if obs.dim() == 2 else obs.unbind(1):  # RLlib adds a time axis
-                window, mask = push(window, mask, now)
-                if hidden is None:
-                    steps.append(network(self.normalizer(window), mask))
-                else:
-                    assert isinstance(network, LSTMActor)
-                    hidden = network.carry(self.normalizer(window), mask, hidden)
-                    steps.append(network.head(hidden))
-            outputs = steps[0] if obs.dim() == 2 else torch.stack(steps, dim=1)
-            state = {"window": window, "mask": mask}
-            if hidden is not None:
-                state |= {"hidden": hidden[..., 0, :], "cell": hidden[..., 1, :]}
+            outputs, state = network(self.normalizer(obs)), None
         actions = self.greedy(outputs) if t is None else self.explore(outputs, t)
         return {Columns.ACTIONS: actions} | ({Columns.STATE_OUT: state} if state else {})
+
+    def _along(
+        self, obs: Tensor, state: Mapping[str, Any] | None, network: nn.Module
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """A recurrent network's outputs for observations `(B, O)`, or RLlib's `(B, steps, O)`, and its state."""
+        if not state:
+            raise ValueError(
+                "This agent's actor is recurrent, over a window of observations: give its state as "
+                'batch["state_in"], get_initial_state() with a batch dimension at an episode\'s start and '
+                'the last call\'s "state_out" after that.'
+            )
+        window, mask, *stored = (torch.as_tensor(state[k], dtype=torch.float32) for k in self.get_initial_state())
+        recurrent_state = stored[0] if stored else None
+        assert isinstance(network, RecurrentActor)
+        steps = []
+        for now in obs.unsqueeze(1).unbind(1) if obs.dim() == 2 else obs.unbind(1):
+            window, mask = append(window, mask, now)
+            outputs, ended = network.unroll(self.normalizer(window), mask, recurrent_state)
+            recurrent_state = ended if stored else None
+            steps.append(outputs)
+        following = {"window": window, "mask": mask}
+        if recurrent_state is not None:
+            following["recurrent_state"] = recurrent_state
+        return steps[0] if obs.dim() == 2 else torch.stack(steps, dim=1), following
 
     @override(TorchRLModule)
     def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
@@ -195,9 +245,9 @@ class UtilityModule(AgentModule):
     `AgentModule`; there is no critic.
     """
 
-    utility: MLPActor | LSTMActor
+    utility: Actor
     target_utility: nn.Module
-    _samples = False
+    draws = False
 
     @override(AgentModule)
     def setup(self) -> None:
@@ -208,7 +258,7 @@ class UtilityModule(AgentModule):
 
     @property
     @override(AgentModule)
-    def acting(self) -> MLPActor | LSTMActor:
+    def acting(self) -> Actor:
         """The utility."""
         return self.utility
 
@@ -226,3 +276,11 @@ class UtilityModule(AgentModule):
     def get_non_inference_attributes(self) -> list[str]:
         """What acting does not need."""
         return ["target_utility"]
+
+
+def _critic_layout(settings: Mapping[str, Any], part: str) -> Layout | None:
+    """The layout of one of the critic's inputs; None if there is no critic."""
+    if (groups := settings.get(f"{part}_layout")) is not None:
+        return as_layout(groups, None, part)
+    size = settings.get(f"critic_{part}_size")  # as checkpoints had it before there were layouts
+    return None if size is None else flat(size, part)

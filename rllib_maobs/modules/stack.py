@@ -9,16 +9,79 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._pytree import tree_map
 
 Params = dict[str, Tensor]
-"""Parameters of M networks by name, each `(M, *shape)`."""
+"""Parameters of stacked networks: each `(M, *shape)`, for the M alike networks of a group, as "group.name"."""
+Function = str | Callable[..., Any]
+"""A method of a network by name, or a function of a network and its inputs."""
 
 
-class _Group(NamedTuple):
-    """Networks that equally many agents use."""
+class PerAgent(NamedTuple):
+    """An input of which every agent has its own part.
 
-    rows: list[int]  # of the networks
-    agents: list[int]  # who uses the first of them, then the second, ...
+    Attributes:
+        tensor: The parts of all N agents, e.g. `(B, N, O)`.
+        dim: The dimension that runs over the agents.
+    """
+
+    tensor: Tensor
+    dim: int = 1
+
+
+class Shared(NamedTuple):
+    """An input that all agents see alike, e.g. `(B, S)`."""
+
+    tensor: Tensor
+
+
+Input = PerAgent | Shared
+
+
+class _Group:
+    """Alike networks, each used by equally many agents: one batched computation.
+
+    Attributes:
+        networks: The M networks.
+        agents: Who uses the first of them, then the second, ...
+        shapes: Of their stacked parameters, `(M, *shape)`, by name.
+    """
+
+    def __init__(self, networks: list[nn.Module], agents: list[int], functions: Sequence[Function]) -> None:
+        self.networks, self.agents = networks, agents
+        # The first network only lends its code; functional_call puts the stacked parameters in its own's place.
+        self._calls = {function: _Call(networks[0], function) for function in functions}
+        self.shapes = {name: (len(networks), *p.shape) for name, p in networks[0].named_parameters()}
+
+    def __call__(self, params: Params, inputs: Sequence[Input], function: Function) -> Any:
+        """The output for this group's agents, in its order, at dimension 1."""
+        networks, users = len(self.networks), len(self.agents) // len(self.networks)
+        tensors, dims = [], []
+        for given in inputs:
+            dim = given.dim if isinstance(given, PerAgent) else None
+            tensors.append(given.tensor if dim is None else _take(given.tensor, self.agents, dim))
+            dims.append(dim)
+        call = self._calls[function]
+
+        def one(p: Params, *args: Tensor) -> Any:
+            return functional_call(call, {f"net.{k}": v for k, v in p.items()}, args)
+
+        def shared(p: Params, *args: Tensor) -> Any:
+            """One network for all its users: its weights meet all their inputs in one product."""
+            if any(dim is not None for dim in dims):
+                return vmap(one, in_dims=(None, *dims), out_dims=1)(p, *args)
+            return _expanded(one(p, *args), users)
+
+        if users == 1:
+            return vmap(one, in_dims=(0, *dims), out_dims=1)(params, *tensors)
+        if networks == 1:
+            return shared({name: value[0] for name, value in params.items()}, *tensors)
+        tensors = [
+            tensor if dim is None else tensor.unflatten(dim, (networks, users))
+            for tensor, dim in zip(tensors, dims, strict=True)
+        ]
+        output = vmap(shared, in_dims=(0, *dims), out_dims=1)(params, *tensors)
+        return tree_map(lambda tensor: tensor.flatten(1, 2), output)
 
 
 class Stack:
@@ -28,63 +91,77 @@ class Stack:
     of one of them, `load_state_dict` into one of them, and an optimiser step on `flat` all see the same
     numbers. One flat vector per role also makes Adam and Polyak averaging a single pass each.
 
-    Agents may share a network (parameter sharing): it then has one row, however many agents use it. Networks of
-    agents whose observations or actions differ in length are padded with zeros to the largest: inputs padded
-    with zeros leave the padding's gradients at zero, so it stays zero, and one batched product serves all.
+    Alike networks (of one class, with parameters of the same names and shapes, and with the same settings and layouts)
+    are one batched computation; others make further ones. Agents may share a network (parameter sharing): it then has
+    its parameters once, however many agents use it. Parameters may have any shape.
 
     Args:
-        networks: Every agent's network, of one kind and depth. One that is listed several times is shared.
-        methods: The methods of them that the stack can call.
-        tie: Whether all agents are to share one row, that of the first network.
+        networks: Every agent's network. One that is listed several times is shared.
+        functions: What the stack can call.
+        names: What to call each network in messages, e.g. "the actor of agent_0".
+        tie: Whether all agents are to share the parameters of the first network.
 
     Raises:
-        ValueError: If the networks differ in more than the sizes of their parameters.
+        ValueError: If a network can't be stacked; says which and why.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], methods: Sequence[str] = ("forward",), tie: bool = False) -> None:
-        distinct = list({id(net): net for net in networks}.values())
-        names = [{name: p.dim() for name, p in net.named_parameters()} for net in distinct]
-        for index, own in enumerate(names):
-            if own != names[0]:
-                raise ValueError(f"Networks 0 and {index} differ, so they cannot be stacked: {names[0]} and {own}.")
-        if any(any(True for _ in net.buffers()) for net in distinct):
-            raise ValueError("Networks with buffers (e.g. BatchNorm) cannot be stacked; use LayerNorm instead.")
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        functions: Sequence[Function] = ("forward",),
+        names: Sequence[str] | None = None,
+        tie: bool = False,
+    ) -> None:
         self.networks = list(networks)
-        self.rows = [0 if tie else next(i for i, d in enumerate(distinct) if d is net) for net in networks]
-        users = [[agent for agent, own in enumerate(self.rows) if own == row] for row in range(max(self.rows) + 1)]
+        self.names = list(names or (f"network {i}" for i in range(len(networks))))
+        for net, name in zip(networks, self.names, strict=True):
+            _check(net, name, like=networks[0] if tie else None)
+        owners = [networks[0]] * len(networks) if tie else self.networks
+        users: dict[int, list[int]] = {}
+        for agent, net in enumerate(owners):
+            users.setdefault(id(net), []).append(agent)
+        alike: dict[Any, list[list[int]]] = {}
+        for agents in users.values():
+            alike.setdefault((_kind(owners[agents[0]]), len(agents)), []).append(agents)
         self._groups = [
-            _Group(rows, [agent for row in rows for agent in users[row]])
-            for count in dict.fromkeys(map(len, users))
-            if (rows := [row for row, own in enumerate(users) if len(own) == count])
+            _Group([owners[agents[0]] for agents in parts], [agent for agents in parts for agent in agents], functions)
+            for parts in alike.values()
         ]
         order = [agent for group in self._groups for agent in group.agents]
-        self._places = [order.index(agent) for agent in range(len(order))]
-        owners = distinct[: 1 if tie else None]
-        # The first network only lends its code; functional_call puts the stacked parameters in its own's place.
-        self._methods = {name: _Method(networks[0], name) for name in methods}
-        self._shapes = {
-            name: (
-                len(owners),
-                *(max(sizes) for sizes in zip(*(n.get_parameter(name).shape for n in distinct), strict=True)),
-            )
-            for name in names[0]
+        self._order = [order.index(agent) for agent in range(len(order))]
+        # Where each agent's parameters are: the group, and which of its networks.
+        self._places = [
+            (g, group.agents.index(agent) * len(group.networks) // len(group.agents))
+            for agent in range(len(order))
+            for g, group in enumerate(self._groups)
+            if agent in group.agents
+        ]
+        self.shapes: dict[str, tuple[int, ...]] = {
+            f"{g}.{name}": shape for g, group in enumerate(self._groups) for name, shape in group.shapes.items()
         }
-        total = sum(torch.Size(shape).numel() for shape in self._shapes.values())
         like = next(networks[0].parameters())
-        self.flat = nn.Parameter(torch.zeros(total, dtype=like.dtype, device=like.device))
+        total = sum(torch.Size(shape).numel() for shape in self.shapes.values())
+        self.flat = nn.Parameter(torch.empty(total, dtype=like.dtype, device=like.device))
         self.params: Params = self.unflatten(self.flat.detach())
-        for row, net in enumerate(owners):
+        for agent, net in enumerate(owners):
+            own = self.own(self.params, agent)
             for name, parameter in net.named_parameters():
-                _corner(self.params[name][row], parameter).copy_(parameter.detach())
-        self._recorded: dict[tuple[Any, ...], Callable[..., Tensor]] = {}
+                own[name].copy_(parameter.detach())
+        self._recorded: dict[tuple[Any, ...], Callable[..., Any]] = {}
         self._bind()
 
     def _bind(self) -> None:
         """Makes `params` and every network's own parameters views of `flat`."""
         self.params = self.unflatten(self.flat.detach())
-        for row, net in zip(self.rows, self.networks, strict=True):
+        for agent, net in enumerate(self.networks):
+            own = self.own(self.params, agent)
             for name, parameter in net.named_parameters():
-                parameter.data = _corner(self.params[name][row], parameter)
+                parameter.data = own[name]
+
+    def own(self, params: Params, agent: int) -> Params:
+        """One agent's part of stacked parameters (or gradients), by its network's names; views."""
+        g, row = self._places[agent]
+        return {name: params[f"{g}.{name}"][row] for name in self._groups[g].shapes}
 
     def share(self, other: Stack) -> None:
         """Uses the tensors of another stack of the same shape from now on, instead of copies of them.
@@ -92,85 +169,110 @@ class Stack:
         Raises:
             ValueError: If the other stack's networks have a different architecture or number.
         """
-        if self._shapes != other._shapes or self.rows != other.rows:
-            raise ValueError(f"Stacks differ: {self._shapes} and {other._shapes}.")
+        if self.shapes != other.shapes or self._places != other._places:
+            raise ValueError(f"Stacks differ: {self.shapes} and {other.shapes}.")
         self.flat = other.flat
         self._bind()
 
-    def pieces(self, flat: Tensor) -> list[Tensor]:
-        """Views of a flat vector `(P,)`, one for each parameter in order, each a vector, too."""
-        return list(flat.split([torch.Size(shape).numel() for shape in self._shapes.values()]))
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """A flat vector `(P,)` cut into one vector for each stacked parameter, in order; views."""
+        return list(flat.split([torch.Size(shape).numel() for shape in self.shapes.values()]))
 
     def unflatten(self, flat: Tensor) -> Params:
         """Views of a flat vector `(P,)` as stacked parameters by name."""
         # Weights lie input by output: the order in which batched products take them, and leave their gradients.
         return {
-            name: piece.view(shape) if len(shape) < 3 else piece.view(shape[0], shape[2], shape[1]).mT
-            for (name, shape), piece in zip(self._shapes.items(), self.pieces(flat), strict=True)
+            name: view.view(shape) if len(shape) != 3 else view.view(shape[0], shape[2], shape[1]).mT
+            for (name, shape), view in zip(self.shapes.items(), self.views(flat), strict=True)
         }
 
     def flatten(self, params: Params) -> list[Tensor]:
-        """The pieces of stacked parameters (or gradients) by name, a vector each; copied only if they lie otherwise."""
-        return [(p if p.dim() < 3 else p.mT).reshape(-1) for p in (params[name] for name in self._shapes)]
+        """Stacked parameters (or gradients) as `views` has them; copied only where they lie otherwise in memory."""
+        return [(p if p.dim() != 3 else p.mT).reshape(-1) for p in (params[name] for name in self.shapes)]
 
-    def __call__(self, params: Params, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
+    def __call__(self, params: Params, *inputs: Input, function: Function = "forward") -> Any:
         """Applies all agents' networks at once.
 
         Args:
             params: Stacked parameters to use, e.g. `self.params` or the tracked ones inside `torch.func.grad`.
-            *inputs: Pairs of a tensor and the dimension of it that runs over the N agents; None for a
-                tensor that all networks see.
-            method: The network's method to call.
+            *inputs: What the networks are called with.
+            function: One of the stack's functions.
 
         Returns:
-            The output, with the N agents at dimension 1: `(B, N, ...)`.
+            The output (a tensor, or a tuple of them), with the N agents at dimension 1: `(B, N, ...)`. Shorter outputs
+            of some agents are padded with zeros.
         """
-        outputs = [self._call(group, params, inputs, method) for group in self._groups]
-        return _take(outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=1), self._places, 1)
+        outputs = []
+        for g, group in enumerate(self._groups):
+            own = {name: params[f"{g}.{name}"] for name in group.shapes}
+            outputs.append(group(own, inputs, function))
+        return outputs[0] if len(outputs) == 1 and self._in_order else self._gathered(outputs)
 
-    def _call(self, group: _Group, params: Params, inputs: Sequence[tuple[Tensor, int | None]], method: str) -> Tensor:
-        """The output for one group's agents, in its order."""
-        networks, users = len(group.rows), len(group.agents) // len(group.rows)
-        own = {name: _take(value, group.rows, 0) for name, value in params.items()}
-        tensors = [tensor if dim is None else _take(tensor, group.agents, dim) for tensor, dim in inputs]
-        dims = [dim for _, dim in inputs]
+    @property
+    def _in_order(self) -> bool:
+        return self._order == list(range(len(self._order)))
 
-        def one(p: Params, *args: Tensor) -> Tensor:
-            return functional_call(self._methods[method], {f"net.{k}": v for k, v in p.items()}, args)
-
-        def shared(p: Params, *args: Tensor) -> Tensor:
-            """One network for all its users: its weights meet all their inputs in one product."""
-            if any(dim is not None for dim in dims):
-                return vmap(one, in_dims=(None, *dims), out_dims=1)(p, *args)
-            same = one(p, *args).unsqueeze(1)
-            return same.expand(-1, users, *same.shape[2:])
-
-        if users == 1:
-            return vmap(one, in_dims=(0, *dims), out_dims=1)(own, *tensors)
-        if networks == 1:
-            return shared({name: value[0] for name, value in own.items()}, *tensors)
-        tensors = [
-            tensor if dim is None else tensor.unflatten(dim, (networks, users))
-            for tensor, dim in zip(tensors, dims, strict=True)
+    def _gathered(self, outputs: list[Any]) -> Any:
+        """The groups' outputs, in the order of the agents."""
+        if isinstance(outputs[0], tuple):
+            return tuple(self._gathered(list(parts)) for parts in zip(*outputs, strict=True))
+        width = max(output.shape[-1] for output in outputs)
+        padded = [
+            output if output.shape[-1] == width else nn.functional.pad(output, (0, width - output.shape[-1]))
+            for output in outputs
         ]
-        return vmap(shared, in_dims=(0, *dims), out_dims=1)(own, *tensors).flatten(1, 2)
+        return _take(torch.cat(padded, dim=1) if len(padded) > 1 else padded[0], self._order, 1)
 
     @torch.no_grad()
-    def act(self, *inputs: tuple[Tensor, int | None], method: str = "forward") -> Tensor:
+    def act(self, *inputs: Input, function: Function = "forward") -> Any:
         """`__call__` with the present parameters and without gradients, for one call after the other.
 
         The plain tensor operations behind `vmap` are recorded at the first call for inputs of some shape, and played
         back from then on: for small inputs most of the time of a call goes into finding them.
         """
-        tensors, dims = zip(*inputs, strict=True)
-        key = (method, dims, *(tensor.shape for tensor in tensors))
+        kinds = [(type(given), given[1:]) for given in inputs]
+        tensors = [given.tensor for given in inputs]
+        key = (function, *map(str, kinds), *(tensor.shape for tensor in tensors))
         if key not in self._recorded:
 
-            def call(params: Params, *tensors: Tensor) -> Tensor:
-                return self(params, *zip(tensors, dims, strict=True), method=method)
+            def call(params: Params, *tensors: Tensor) -> Any:
+                again = [kind(tensor, *rest) for tensor, (kind, rest) in zip(tensors, kinds, strict=True)]
+                return self(params, *again, function=function)
 
             self._recorded[key] = make_fx(call)(self.params, *tensors).forward
         return self._recorded[key](self.params, *tensors)
+
+
+def _check(net: nn.Module, name: str, like: nn.Module | None) -> None:
+    """Raises a ValueError if a network can't be stacked."""
+    if buffers := [key for key, _ in net.named_buffers()]:
+        raise ValueError(
+            f"{name} ({type(net).__name__}) can't be stacked: it has the buffers {buffers} (BatchNorm?). Use LayerNorm, "
+            f"or parameters with requires_grad=False."
+        )
+    parameters = list(net.named_parameters())
+    if not parameters:
+        raise ValueError(f"{name} ({type(net).__name__}) can't be stacked: it has no parameters.")
+    kinds = {(p.dtype, p.device) for _, p in parameters}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"{name} ({type(net).__name__}) can't be stacked: its parameters must be of one type and on one device, "
+            f"not { {key: (p.dtype, str(p.device)) for key, p in parameters} }."
+        )
+    if like is not None and _kind(net) != _kind(like):
+        raise ValueError(f"{name} ({net}) can't share the parameters of {like}: they differ.")
+
+
+def _kind(net: nn.Module) -> Any:
+    """What alike networks have in common: class, parameters, layers, and their own settings and layouts."""
+    shapes = tuple((name, tuple(p.shape)) for name, p in net.named_parameters())
+    settings = {name: value for name, value in vars(net).items() if not name.startswith("_") and name != "training"}
+    return type(net), shapes, repr(net), repr(settings)
+
+
+def _expanded(output: Any, users: int) -> Any:
+    """What all users of a network have alike, `(B, users, ...)`."""
+    return tree_map(lambda same: same.unsqueeze(1).expand(-1, users, *same.shape[1:]), output)
 
 
 def _take(tensor: Tensor, positions: list[int], dim: int) -> Tensor:
@@ -181,19 +283,17 @@ def _take(tensor: Tensor, positions: list[int], dim: int) -> Tensor:
     return tensor.index_select(dim, torch.tensor(positions, device=tensor.device))
 
 
-def _corner(padded: Tensor, like: Tensor) -> Tensor:
-    """The part of a padded tensor that has another's shape."""
-    return padded[tuple(slice(size) for size in like.shape)]
+class _Call(nn.Module):
+    """Lets `functional_call` run a method other than forward, or a function of the network."""
 
-
-class _Method(nn.Module):
-    """Lets `functional_call` run a method other than forward."""
-
-    def __init__(self, net: nn.Module, method: str) -> None:
+    def __init__(self, net: nn.Module, function: Function) -> None:
         super().__init__()
-        self.net = net
-        self.method = method
+        self.net, self.function = net, function
 
-    def forward(self, *args: Tensor) -> Tensor:
-        """Calls the method."""
-        return getattr(self.net, self.method)(*args)
+    def forward(self, *args: Tensor) -> Any:
+        """Calls it."""
+        return (
+            getattr(self.net, self.function)(*args)
+            if isinstance(self.function, str)
+            else self.function(self.net, *args)
+        )

@@ -1,0 +1,415 @@
+"""JointLearner: one stacked update of all agents, gradients routed to the role they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from ray.rllib.core import ALL_MODULES
+from ray.rllib.core.learner.learner import Learner
+from ray.rllib.core.learner.torch.torch_learner import TorchLearner
+from ray.rllib.core.learner.training_data import TrainingData
+from ray.rllib.utils.annotations import override
+from ray.rllib.utils.metrics import (
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    NUM_ENV_STEPS_TRAINED,
+    NUM_ENV_STEPS_TRAINED_LIFETIME,
+)
+from torch import Tensor
+from torch.func import grad_and_value
+
+from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
+from rllib_maobs.learner.update import StackedAdam, clipped, compiled
+from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.normalizer import Normalizers
+from rllib_maobs.modules.team import Actors, Critics
+from rllib_maobs.replay import Batch, Moment
+
+NUM_UPDATES_LIFETIME = "num_updates_lifetime"
+_PROGRESS = "progress"
+_LAYOUT = 3  # how numbers lie in flat tensors (`Stack`), and so in the optimisers' saved state
+
+
+class JointLearner(TorchLearner):
+    """Trains a fixed team from joint minibatches; the base of all learners here.
+
+    An algorithm overrides `critic_loss` and, if it has actors, `actor_loss`. Both are given the same parameters,
+    those from before the update: first all gradients are computed, then critics (with their mixer) and actors
+    step, then the targets move (the order of the code base the paper grew from). The critic loss moves critics
+    and nothing else, the actor loss actors: in each the other role's parameters are constants.
+
+    All agents' networks are stacked (see `Stack`), so a loss is one batched computation instead of a loop
+    over agents. With `config.framework(torch_compile_learner=True)` it is compiled, once per run; the numbers
+    are the same up to float rounding. Compiled code keeps the Python values that a loss read when it was compiled:
+    settings of `self.config`, attributes of `self`, numbers from elsewhere. What is to change during training is a
+    tensor of the minibatch, or `self.stage`: each stage is compiled on its own (see `stage_at`).
+
+    Attributes:
+        has_actors: Whether there are actors, and an `actor_loss`.
+        parts: The stacked networks, and the team's constants.
+        target_parts: The target networks.
+        normalizers: The agents' running normalisation of observations, or None.
+        stage: The training stage, see `stage_at`.
+    """
+
+    has_actors = True
+
+    @override(TorchLearner)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        # RLlib would compile forward_train, which a stacked update never calls; what is compiled is ours.
+        self._torch_compile_forward_train = self._torch_compile_complete_update = False
+        self._sum: Tensor | None = None
+        self._updates = self._actor_updates = 0
+        self._updates_lifetime = 0
+        # What an update may depend on but for numbers in tensors: each combination is compiled on its own.
+        self.stage = ""
+        self._compiled: dict[tuple[str, bool, int], Callable[..., Any]] = {}
+        self._with_actors = self.has_actors
+
+    # What an algorithm defines.
+
+    def critic_loss(self, online: TeamNetworks, target: TeamNetworks, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The critics' loss, as the algorithm defines it.
+
+        It is traced and compiled: what it reads of `self.config` and `self` is a constant from then on.
+
+        Args:
+            online: The networks; the gradient is taken to the critics' and the mixer's parameters, actors are
+                constants.
+            target: The target networks, all constants.
+            batch: The minibatch.
+
+        Returns:
+            The losses, one for each agent `(N,)` or one for the team `(1,)`; and what they are the losses of, `(B, N)`
+            or `(B, 1)`.
+        """
+        raise TypeError(f"{type(self).__name__} defines no critic_loss: derive a learner that does.")
+
+    def actor_loss(self, actions: Tensor, online: TeamNetworks, batch: Batch) -> Tensor:
+        """The actors' loss, as the algorithm defines it; what `critic_loss` says of Python values holds here, too.
+
+        Args:
+            actions: mu(o), every actor's current action, `(B, N, A)`; the gradient goes through them alone.
+            online: The networks from before the update, all constants.
+            batch: The minibatch.
+
+        Returns:
+            The losses, `(N,)` or `(1,)`.
+        """
+        raise TypeError(f"{type(self).__name__} defines no actor_loss: derive a learner that does.")
+
+    @property
+    def trains_mixer(self) -> bool:
+        """Whether there is a mixer and this stage trains it."""
+        return MIXER in self._roles
+
+    def stage_at(self, env_steps: int) -> str:
+        """The training stage after some env steps, for algorithms that change their losses on the way."""
+        return ""
+
+    # The update.
+
+    def joint_gradients(
+        self, online: dict[str, Params], target: dict[str, Params], normalizer: Params, batch: Batch
+    ) -> tuple[dict[str, list[Tensor]], Tensor]:
+        """All roles' gradients and the report: what is compiled. A derived class may override it.
+
+        Args:
+            online: Stacked parameters by role.
+            target: Those of the target networks.
+            normalizer: Those of the normalisation of observations.
+            batch: The minibatch, as replay gave it.
+
+        Returns:
+            As `gradients`.
+        """
+        batch = self.prepare(batch, normalizer)
+        trained = [CRITIC, *([MIXER] if self.trains_mixer else []), *([ACTOR] if self._with_actors else [])]
+
+        def total(params: dict[str, Params]) -> tuple[Tensor, tuple[Tensor, ...]]:
+            # Each loss sees the other role's parameters as they are outside of the gradient: constants.
+            tracked = TeamNetworks(self.parts, {**online, **params, ACTOR: online[ACTOR]})
+            losses, q = self.critic_loss(tracked, TeamNetworks(self.target_parts, target), batch)
+            if not self._with_actors:
+                return losses.sum(), (losses, q)
+            constant = TeamNetworks(self.parts, {**online, ACTOR: params[ACTOR]}, constant=tracked)
+            outputs = constant.outputs(batch.now)
+            actor_losses = self.actor_loss(constant.actions(outputs, batch.noise), constant, batch)
+            regularization = self.config.action_regularization * outputs.square().mean((0, 2)).sum()
+            return losses.sum() + actor_losses.sum() + regularization, (losses, q, actor_losses)
+
+        # Sums over agents only gather the losses: agent i's parameters are in no other agent's loss, but for
+        # the algorithms whose loss is joint by definition, and agents that share their parameters.
+        by_role, (_, (losses, q, *actor_losses)) = grad_and_value(total, has_aux=True)(
+            {role: online[role] for role in trained}
+        )
+        report = [losses, q.mean(0), *actor_losses]
+        if self.has_actors and not self._with_actors:
+            report.append(torch.zeros_like(losses))
+        gradients = {
+            role: self._roles[role].flatten(clipped(gradient, self.config.grad_clip, self.config.grad_clip_by))
+            for role, gradient in by_role.items()
+        }
+        return gradients, torch.stack([values.expand(len(self.config.team.agents)) for values in report])
+
+    def gradients(self, batch: Batch, *, with_actors: bool | None = None) -> tuple[dict[str, list[Tensor]], Tensor]:
+        """All roles' gradients of one minibatch, and the report; compiled if so configured.
+
+        Args:
+            batch: The minibatch, as replay gave it.
+            with_actors: Whether those of the actors, too; None if the algorithm has actors.
+
+        Returns:
+            Gradients of "critic", "mixer" and "actor" (those that there are), a vector for each stacked parameter; and,
+            for every agent, the critic's loss, mean Q and the actor's loss, `(3, N)`; `(2, N)` if there are no actors.
+        """
+        self._with_actors = self.has_actors if with_actors is None else with_actors
+        normalizer = {} if self.normalizers is None else self.normalizers.params
+        arguments = self._params_of(self._roles), self._params_of(self._targets), normalizer, batch
+        if not self.config.torch_compile_learner:
+            return self.joint_gradients(*arguments)
+        key = (self.stage, self._with_actors, len(batch.rewards))
+        if key not in self._compiled:
+            self._compiled[key] = compiled(self.joint_gradients, self.config, self._device)
+        return self._compiled[key](*arguments)
+
+    @staticmethod
+    def _params_of(stacks: dict[str, Stack]) -> dict[str, Params]:
+        """Parameters of every role; none where the algorithm has no such role."""
+        return {role: stacks[role].params if role in stacks else {} for role in (ACTOR, CRITIC, MIXER)}
+
+    @torch.no_grad()
+    def step(self, batch: Batch) -> Tensor:
+        """One update: gradients, Adam, Polyak averaging.
+
+        With `policy_delay` the actors and all targets take part in every so many updates only (TD3).
+
+        Args:
+            batch: The minibatch, as replay gave it.
+
+        Returns:
+            The report of `gradients`.
+        """
+        with_targets = self._updates_lifetime % self.config.policy_delay == 0
+        gradients, report = self.gradients(batch, with_actors=with_targets and self.has_actors)
+        self._updates_lifetime += 1
+        self._actor_updates += with_targets
+        for role, gradient in gradients.items():
+            self._adam.step(role, gradient)
+        if with_targets:
+            for role, stack in self._roles.items():
+                self._targets[role].flat.lerp_(stack.flat, self.config.tau)
+        return report
+
+    def prepare(self, batch: Batch, normalizer: Params) -> Batch:
+        """A minibatch as the losses see it: observations normalised, rewards scaled, and with its states."""
+        now, following = (self._prepared(moment, normalizer) for moment in (batch.now, batch.next))
+        return batch._replace(now=now, next=following, rewards=batch.rewards * self.config.reward_scale)
+
+    def _prepared(self, moment: Moment, normalizer: Params) -> Moment:
+        if self.normalizers is not None:
+            if moment.window is not None:
+                window = self.normalizers.normalized(normalizer, moment.window)
+                moment = moment._replace(window=window, obs=window[:, :, -1])
+            else:
+                moment = moment._replace(obs=self.normalizers.normalized(normalizer, moment.obs))
+        if moment.state is None and self.config.uses_state:
+            state = moment.obs.flatten(1)
+            moment = moment._replace(state=state if self._state_columns is None else state[:, self._state_columns])
+        return moment
+
+    # RLlib's side of it.
+
+    @override(TorchLearner)
+    def configure_optimizers(self) -> None:
+        """Stacks the agents' networks and registers the optimisers (called by RLlib's `build`).
+
+        One Adam for the actors, and one for the critics together with their mixers.
+        """
+        config, team = self.config, self.config.team
+        modules = [self.module[mid].unwrapped() for mid in config.module_ids]
+        # Constants of the losses, and the random numbers that they need, drawn outside of what is compiled.
+        device = self._device
+        mask = torch.from_numpy(team.action_mask).to(device)
+        ids = torch.eye(len(team.agents), device=device) if config.critics_are_told else None
+        columns = torch.tensor(config.state_columns, device=device)
+        self._state_columns = None if len(columns) == len(team.agents) * team.observation_size else columns
+        self.parts, self.target_parts = (
+            self.stacks(modules, prefix, None if mask.all() else mask, ids) for prefix in ("", "target_")
+        )
+        self._roles, self._targets = map(self._by_role, (self.parts, self.target_parts))
+        self.normalizers = Normalizers([m.normalizer for m in modules]) if config.normalize_observations else None
+
+        optimizer_of: dict[str, torch.optim.Adam] = {}
+        for name, roles, lr in (
+            (CRITIC, (CRITIC, MIXER), config.critic_lr),
+            (ACTOR, (ACTOR,), config.actor_lr),
+        ):
+            own = [role for role in roles if role in self._roles]
+            if own:
+                parameters = [self._roles[role].flat for role in own]
+                optimizer = torch.optim.Adam(parameters)
+                self.register_optimizer(
+                    module_id=ALL_MODULES,
+                    optimizer_name=name,
+                    optimizer=optimizer,
+                    params=parameters,
+                    lr_or_lr_schedule=lr,
+                )
+                optimizer_of |= dict.fromkeys(own, optimizer)
+        self._adam = StackedAdam(self._roles, optimizer_of)
+        self._draw: Callable[..., Tensor] | None = None
+        if self.has_actors:
+            self._draw = torch.rand if team.discrete else torch.randn if config.target_noise else None
+        self._generator = torch.Generator().manual_seed(config.seed or 0)
+
+    def stacks(
+        self, modules: Sequence[Any], prefix: str, action_mask: Tensor | None, agent_ids: Tensor | None
+    ) -> Parts:
+        """Stacks every agent's networks.
+
+        Args:
+            modules: The agents' RLModules; one that several share is listed for each of them.
+            prefix: "" for the online networks, "target_" for the target networks.
+            action_mask: See `Parts`.
+            agent_ids: See `Parts`.
+        """
+        config = self.config
+        actors, critics = (
+            ([getattr(m, f"{prefix}{role}") for m in modules], [f"the {role} of {a}" for a in config.team.agents])
+            for role in (ACTOR, CRITIC)
+        )
+        return Parts(
+            config=config,
+            actors=Actors(*actors),
+            acting_role=ACTOR,
+            critics=Critics(*critics, tie=config.ties_critics),
+            mixers=self.mixers(prefix),
+            action_mask=action_mask,
+            agent_ids=agent_ids,
+        )
+
+    def mixers(self, prefix: str) -> Stack | None:
+        """The mixers, stacked; None if the algorithm has none."""
+        if MIXER not in self.module:
+            return None
+        return Stack(list(getattr(self.module[MIXER].unwrapped(), f"{prefix}mixers")))
+
+    @staticmethod
+    def _by_role(parts: Parts) -> dict[str, Stack]:
+        """The stacks that have parameters of their own, by role."""
+        stacks: dict[str, Stack | None] = {CRITIC: parts.critics, MIXER: parts.mixers}
+        stacks = {parts.acting_role: parts.actors, **{role: s for role, s in stacks.items() if s is not None}}
+        return {role: stack for role, stack in stacks.items() if stack is not None}
+
+    @property
+    def acting(self) -> Actors:
+        """The networks that act."""
+        return self.parts.actors
+
+    @override(Learner)
+    def update(
+        self,
+        batch: Any = None,
+        *,
+        training_data: TrainingData | None = None,
+        timesteps: dict[str, Any] | None = None,
+        _no_metrics_reduce: bool = False,
+        **kwargs: Any,
+    ) -> Any:
+        """One update for each of K minibatches, which the batch holds along its first axis.
+
+        Args:
+            batch: A `Batch` whose tensors have a further leading axis, `(K, B, ...)`.
+            training_data: The same, wrapped by RLlib's LearnerGroup.
+            timesteps: RLlib's time, for stages of training and learning-rate schedules.
+            _no_metrics_reduce: Whether to go on collecting metrics instead of returning them.
+            **kwargs: Ignored.
+
+        Returns:
+            Means over the updates since the last returned result, for every module, or None.
+        """
+        whole: Batch = training_data.batch if training_data is not None else batch
+        timesteps = timesteps or {}
+        self.before_gradient_based_update(timesteps=timesteps)
+        self.stage = self.stage_at(timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0))
+        if self._draw is not None:
+            noise = self._draw(whole.actions.shape, generator=self._generator)
+            whole = whole._replace(noise=noise.to(whole.actions.device))
+        for minibatch in whole.unbind():
+            report = self.step(minibatch)
+            self._sum = report.clone() if self._sum is None else self._sum.add_(report)
+        count, size = whole.rewards.shape[:2]
+        self._updates += count
+        self._weights_seq_no += 1
+        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED), count * size, reduce="sum")
+        self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED_LIFETIME), count * size, reduce="lifetime_sum")
+        return None if _no_metrics_reduce else self.report(timesteps=timesteps)
+
+    def report(self, *, timesteps: dict[str, Any] | None = None) -> Any:
+        """Means of what the updates since the last report said, and the learning rates of their time.
+
+        Args:
+            timesteps: RLlib's time, for learning-rate schedules.
+
+        Returns:
+            RLlib's reduced metrics, or None if there was no update.
+        """
+        if self._sum is None:
+            return None
+        counts = {"critic_loss": self._updates, "q_mean": self._updates, "actor_loss": max(1, self._actor_updates)}
+        for (name, count), values in zip(counts.items(), self._sum.tolist(), strict=False):
+            by_module: dict[str, list[float]] = {}
+            for mid, value in zip(self.config.module_ids, values, strict=True):
+                by_module.setdefault(mid, []).append(value / count)
+            for mid, of_agents in by_module.items():
+                self.metrics.log_value((mid, name), sum(of_agents) / len(of_agents), window=1)
+        self.metrics.log_value((ALL_MODULES, NUM_UPDATES_LIFETIME), self._updates, reduce="lifetime_sum")
+        self._sum, self._updates, self._actor_updates = None, 0, 0
+        self.after_gradient_based_update(timesteps=timesteps or {})
+        return self.metrics.reduce()
+
+    def update_normalizers(self, observations: NDArray[np.float32]) -> None:
+        """Takes newly sampled observations `(..., N, O)` into the running normalisation, if there is one."""
+        if self.normalizers is not None:
+            self.normalizers.merge(torch.from_numpy(np.require(observations, np.float32, "W")).to(self._device))
+
+    @override(Learner)
+    def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """RLlib's state, the number of updates made and the random numbers to come."""
+        state: dict[str, Any] = super().get_state(*args, **kwargs)
+        generator = self._generator.get_state().numpy()
+        state[_PROGRESS] = {"updates": self._updates_lifetime, "generator": generator, "layout": _LAYOUT}
+        return state
+
+    @override(Learner)
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a saved state.
+
+        Raises:
+            ValueError: If a revision saved it whose optimisers' numbers lie in another order.
+        """
+        if _PROGRESS in state and state[_PROGRESS].get("layout") != _LAYOUT:
+            raise ValueError(
+                f"This learner's state was saved by an earlier revision of rllib-maobs, whose optimisers' numbers lie "
+                f"in another order (layout {state[_PROGRESS].get('layout', 1)}, here {_LAYOUT}): go on with it there, "
+                f"or take its trained agents with RLModule.from_checkpoint."
+            )
+        super().set_state(state)
+        self._adam.bind()  # the optimisers' tensors are new ones
+        if _PROGRESS in state:
+            self._updates_lifetime = state[_PROGRESS]["updates"]
+            self._generator.set_state(torch.from_numpy(state[_PROGRESS]["generator"]))
+
+    @override(TorchLearner)
+    def _log_trainable_parameters(self) -> None:
+        """Nothing: RLlib logs these once and reports them as NaN from the second iteration on."""
+
+    @override(TorchLearner)
+    def compute_loss_for_module(self, **kwargs: Any) -> Any:
+        """Not how this learner works: its losses are joint."""
+        raise TypeError("A JointLearner has no loss per module: see critic_loss and actor_loss.")

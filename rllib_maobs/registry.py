@@ -1,0 +1,136 @@
+"""Classes that plug in: by name, by themselves, or by where they can be imported from; and the settings they take."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, Generic, TypeVar, get_type_hints
+
+from rllib_maobs.options import check_value, closest
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T], Mapping[str, type[T]]):
+    """Classes of one kind by name.
+
+    Args:
+        kind: What they are, for messages, e.g. "actor".
+        base: What they derive from.
+    """
+
+    def __init__(self, kind: str, base: type[T]) -> None:
+        self._kind, self._base = kind, base
+        self._classes: dict[str, type[T]] = {}
+
+    def __getitem__(self, name: str) -> type[T]:
+        return self._classes[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._classes)
+
+    def __len__(self) -> int:
+        return len(self._classes)
+
+    def register(self, name: str, cls: type[T]) -> None:
+        """Makes a class known by a name in this process; it replaces one of the same name.
+
+        Ray's worker processes do not see it: there, give the class itself, or its place as "package.module:Class".
+
+        Raises:
+            ValueError: If it is no such class.
+        """
+        if not (isinstance(cls, type) and issubclass(cls, self._base)):
+            raise ValueError(f"Cannot register {cls!r} as {self._kind}; legal is a subclass of {self._base.__name__}.")
+        self._classes[name] = cls
+
+    def resolve(self, given: Any) -> type[T]:
+        """The class that is meant.
+
+        Args:
+            given: A name, the class itself, or its place as "package.module:Class".
+
+        Raises:
+            ValueError: If it is neither; names what is legal.
+        """
+        cls = given
+        if isinstance(given, str):
+            if given in self._classes:
+                return self._classes[given]
+            cls = _imported(given)
+        if isinstance(cls, type) and issubclass(cls, self._base):
+            return cls
+        hint = closest(given, list(self._classes)) if isinstance(given, str) else ""
+        raise ValueError(
+            f"{self._kind} {given!r} is illegal{hint}; legal are {', '.join(map(repr, self._classes))}, a subclass of "
+            f'{self._base.__name__}, or where to import one from, as "package.module:Class".'
+        )
+
+    def reference(self, given: Any) -> Any:
+        """How a checkpoint refers to a class: its name, its place, or the class itself if it has neither.
+
+        A class of a script or a function can't be imported elsewhere: it is pickled whole.
+        """
+        if isinstance(given, str):
+            return given
+        for name, cls in self._classes.items():
+            if cls is given and cls.__module__.split(".")[0] == __name__.split(".")[0]:
+                return name
+        importable = given.__module__ != "__main__" and "<locals>" not in given.__qualname__
+        return f"{given.__module__}:{given.__qualname__}" if importable else given
+
+
+def _imported(place: str) -> Any:
+    """What lies at "package.module:Class"; None if there is nothing."""
+    module, colon, name = place.partition(":")
+    if not colon:
+        return None
+    try:
+        found = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError):
+        return None
+    return found
+
+
+def settings_of(cls: type[Any], reserved: Collection[str] = ()) -> dict[str, inspect.Parameter]:
+    """The settings that a class takes: its constructor's parameters but for some."""
+    parameters = dict(inspect.signature(cls).parameters)
+    return {name: p for name, p in parameters.items() if name not in reserved}
+
+
+def check_settings(cls: type[Any], given: Mapping[str, Any], reserved: Collection[str] = ()) -> None:
+    """Checks settings against a constructor's signature and its type hints.
+
+    Hints that are understood are those of environment options, e.g. `Annotated[int, Range(1)]`; what has another hint
+    is the constructor's own to check.
+
+    Args:
+        cls: The class that the settings are for.
+        given: The settings by name.
+        reserved: Parameters of its constructor that are not settings.
+
+    Raises:
+        ValueError: For a name that it does not take, a value that its hint excludes, or one that is missing.
+    """
+    legal = settings_of(cls, reserved)
+    anything = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in legal.values())
+    legal = {name: p for name, p in legal.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+    try:
+        hints = get_type_hints(cls.__init__, include_extras=True)
+    except NameError:  # hints of names that only a type checker sees
+        hints = {}
+    for name, value in given.items():
+        if name not in legal:
+            if anything and name not in reserved:
+                continue
+            raise ValueError(
+                f"{cls.__name__} has no setting {name!r}{closest(name, list(legal))}; legal are {', '.join(legal)}."
+            )
+        if name in hints:
+            check_value(value, hints[name], name, cls.__name__)
+    missing = [name for name, p in legal.items() if p.default is p.empty and name not in given]
+    if missing:
+        raise ValueError(f"{cls.__name__} needs the settings {', '.join(missing)}, which are not given.")

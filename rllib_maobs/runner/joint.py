@@ -1,0 +1,340 @@
+"""JointEnvRunner: steps E environment copies at once and returns joint columns instead of episode objects."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import uuid
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import ray
+import torch
+from numpy.typing import NDArray
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core import COMPONENT_RL_MODULE
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
+from ray.rllib.env import INPUT_ENV_SPACES
+from ray.rllib.env.env_runner import EnvRunner
+from ray.rllib.utils.annotations import override
+from ray.rllib.utils.checkpoints import Checkpointable
+from ray.rllib.utils.metrics import (
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    RLMODULE_INFERENCE_TIMER,
+    SAMPLE_TIMER,
+    WEIGHTS_SEQ_NO,
+)
+
+from rllib_maobs.envs.joint import snapshot
+from rllib_maobs.envs.team import JointEnv, Team
+from rllib_maobs.modules.normalizer import Normalizers
+from rllib_maobs.modules.team import Actors
+from rllib_maobs.runner.acting import Acting
+from rllib_maobs.runner.episodes import EPISODE_METRICS, Episodes
+from rllib_maobs.runner.making import make_env
+
+COMPONENT_SAMPLING = "sampling"
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """L steps of E copies as joint columns: the arguments of `JointReplayBuffer.add`, which explains them."""
+
+    obs: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    final_obs: NDArray[np.float32]
+    state: NDArray[np.float32] | None = None
+    final_state: NDArray[np.float32] | None = None
+    recurrent_state: NDArray[np.float32] | None = None
+    final_recurrent_state: NDArray[np.float32] | None = None
+    source: str = ""
+    start: int = 0
+
+    def env_steps(self) -> int:
+        """L * E."""
+        return self.terminated.size
+
+    def agent_steps(self) -> int:
+        """L * E * N."""
+        return self.rewards.size
+
+
+class JointEnvRunner(EnvRunner, Checkpointable):
+    """Samples a fixed team's joint steps from E copies that step together.
+
+    All agents of all copies act in one stacked forward pass, and what comes back are arrays `(L, E, N, ...)`.
+    Set by the algorithms of this package as `env_runner_cls`; `sample()` and `get_metrics()` keep RLlib's
+    signatures and result keys, so RLlib's evaluation, fault tolerance and Tune work with it unchanged.
+    RLlib's `on_episode_*` callbacks are not called: there are no episode objects to hand to them.
+    """
+
+    @override(EnvRunner)
+    def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
+        super().__init__(config=config, **kwargs)
+        self.team: Team = self.config.team
+        self.module_ids: tuple[str, ...] = self.config.module_ids
+        self.env: JointEnv | None = None
+        self.num_envs: int = self.config.num_envs_per_env_runner
+        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
+        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
+        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation),))
+        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
+        self._generator = torch.Generator().manual_seed(int(seeds.generate_state(1)[0]))
+        if self.worker_index is None or self.worker_index > 0 or self.num_workers == 0:
+            self.make_env()
+        elif self.config.create_env_on_local_worker:
+            self.make_env()
+        self.module: MultiRLModule | None = None
+        self._weights_seq_no = 0
+        self.make_module()
+
+        self._obs: NDArray[np.float32] | None = None
+        self._needs_reset = True
+        self._episodes = Episodes(self.team.agents, self.module_ids, self.num_envs)
+        self._steps_sampled = 0
+        self._source = f"{self.worker_index}-{uuid.uuid4().hex}"
+
+    @override(EnvRunner)
+    def make_env(self) -> None:
+        """Makes the E copies anew; they are reset at the next `sample()`."""
+        if self.env is not None:
+            self.env.close()
+        self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
+        self._needs_reset = True
+
+    @override(EnvRunner)
+    def make_module(self) -> None:
+        """Builds the agents' modules and stacks their actors, so that all act in one call."""
+        self.module = self.config.get_multi_rl_module_spec(spaces=self.get_spaces(), inference_only=True).build()
+        modules = [self.module[mid] for mid in self.module_ids]
+        self.acting = Acting(modules, self.team, self.num_envs, self._generator)
+
+    def share(self, actors: Actors, normalizers: Normalizers | None) -> None:
+        """Acts with the tensors of a learner in this process from now on, so weights need no syncing."""
+        self.acting.share(actors, normalizers)
+
+    @override(EnvRunner)
+    def sample(
+        self,
+        *,
+        num_timesteps: int | None = None,
+        num_episodes: int | None = None,
+        explore: bool | None = None,
+        random_actions: bool = False,
+        force_reset: bool = False,
+        **kwargs: Any,
+    ) -> list[JointSample]:
+        """Steps the copies.
+
+        Args:
+            num_timesteps: Env steps to sample at least, over all copies. None: `rollout_fragment_length` steps
+                of every copy.
+            num_episodes: Episodes to sample instead. They are dealt out to the copies in equal shares, so short
+                episodes are not favoured, and all copies start afresh.
+            explore: Whether to explore; None takes the config's.
+            random_actions: Whether to act uniformly at random.
+            force_reset: Whether all copies start afresh.
+            **kwargs: Ignored.
+
+        Returns:
+            One `JointSample` in a list.
+
+        Raises:
+            ValueError: If an observation or reward is not finite; names the agent, copy and step.
+        """
+        if self.env is None:
+            raise ValueError(f"{self} has no environment, so it cannot sample.")
+        if num_timesteps is not None and num_episodes is not None:
+            raise ValueError("Give either num_timesteps or num_episodes, not both.")
+        explore = self.config.explore if explore is None else explore
+        with self.metrics.log_time(SAMPLE_TIMER):
+            if force_reset or num_episodes is not None or self._needs_reset:
+                self._reset_all()
+            start = self._steps_sampled
+            if num_episodes is not None:
+                steps = self._play(num_episodes, explore, random_actions)
+                self._needs_reset = True
+            else:
+                length = self.config.get_rollout_fragment_length(self.worker_index)
+                if num_timesteps is not None:
+                    length = math.ceil(num_timesteps / self.num_envs)
+                steps = [self._step(explore, random_actions) for _ in range(length)]
+        rows, finals = zip(*steps, strict=True)
+        columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        final_columns = {f"final_{name}": np.concatenate([final[name] for final in finals]) for name in finals[0]}
+        return [JointSample(**columns, **final_columns, source=self._source, start=start)]
+
+    def _reset_all(self) -> None:
+        assert self.env is not None
+        # Copies are seeded once; after that each goes on in its own stream.
+        seeds = self._env_seeds if self._obs is None else None
+        self._obs, _ = self.env.reset(seed=seeds)
+        self._check_finite("observation", self._obs)
+        everyone = np.ones(self.num_envs, dtype=np.bool_)
+        self._episodes.begin(everyone)
+        self.acting.forget(everyone)
+        self._needs_reset = False
+        self._steps_sampled += 1  # a gap: what follows is not linked to what was sampled before
+
+    def _play(self, num_episodes: int, explore: bool, random_actions: bool) -> list[Any]:
+        """Plays episodes: copy e plays its share of them; further ones of it are not counted."""
+        left = np.full(self.num_envs, num_episodes // self.num_envs)
+        left[: num_episodes % self.num_envs] += 1
+        steps = []
+        while (left > 0).any():
+            row, final = self._step(explore, random_actions, counted=left > 0)
+            steps.append((row, final))
+            left -= row["terminated"] | row["truncated"]
+        return steps
+
+    def _step(
+        self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """One step of all copies.
+
+        Returns:
+            The row of every column `(E, ...)`, and what there was at the end of the episodes that ended `(D, ...)`.
+        """
+        assert self.env is not None and self._obs is not None
+        row = self._sight()
+        with self.metrics.log_time(RLMODULE_INFERENCE_TIMER):
+            t = self.num_env_steps_sampled_lifetime
+            row["actions"] = self.acting(self._obs, t, explore=explore, random=random_actions)
+        played = self.acting.to_env(row["actions"])
+        self._obs, row["rewards"], row["terminated"], row["truncated"], info = self.env.step(played)
+        self._episodes.add(row["rewards"])
+        self._check_finite("observation", self._obs)
+        self._check_finite("reward", row["rewards"])
+        self._steps_sampled += 1
+        self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
+        done = row["terminated"] | row["truncated"]
+        if not done.any():
+            return row, {name: row[name][:0] for name in ("obs", "state", "recurrent_state") if name in row}
+        final = {name: values[done] for name, values in self._sight().items()}
+        self._episodes.finish(done if counted is None else done & counted, info.get(EPISODE_METRICS, {}))
+        self._episodes.begin(done)
+        self.acting.forget(done)
+        self._obs, _ = self.env.reset(mask=done)
+        self._check_finite("observation", self._obs)
+        return row, final
+
+    def _sight(self) -> dict[str, Any]:
+        """What there is to see and to remember now: observations, and where they are stored states."""
+        assert self.env is not None
+        seen: dict[str, Any] = {"obs": self._obs}
+        if self.team.state_size:
+            seen["state"] = self.env.state("world")
+        if (recurrent_state := self.acting.recurrent_state) is not None:
+            seen["recurrent_state"] = recurrent_state
+        return seen
+
+    def _check_finite(self, what: str, values: NDArray[np.float32]) -> None:
+        if np.isfinite(values).all():
+            return
+        copy, agent = np.argwhere(~np.isfinite(values))[0][:2]
+        raise ValueError(
+            f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._episodes.lengths[copy]} "
+            f"of its episode in environment copy {copy} (runner {self.worker_index}): {values[copy, agent]}."
+        )
+
+    @override(EnvRunner)
+    def get_metrics(self) -> Any:
+        """RLlib's result keys for what was sampled since the last call, and each episode's own metrics."""
+        # The results merge all runners' windows into one.
+        window = max(1, math.ceil(self.config.metrics_num_episodes_for_smoothing / max(1, self.num_workers)))
+        self._episodes.report(self.metrics, window)
+        self.metrics.log_value(WEIGHTS_SEQ_NO, self._weights_seq_no, window=1)
+        return self.metrics.reduce()
+
+    @override(EnvRunner)
+    def get_spaces(self) -> dict[str, tuple[gym.Space[Any], gym.Space[Any]]]:
+        """The spaces of every module, and under RLlib's own key those of every agent."""
+        team = self.team
+        return {
+            INPUT_ENV_SPACES: (
+                gym.spaces.Dict(list(zip(team.agents, team.observation_spaces, strict=True))),
+                gym.spaces.Dict(list(zip(team.agents, team.action_spaces, strict=True))),
+            ),
+            **{mid: team.spaces(agent) for mid, agent in zip(self.module_ids, team.agents, strict=True)},
+        }
+
+    @override(EnvRunner)
+    def assert_healthy(self) -> None:
+        """Checks that there is something to sample from and to act with."""
+        assert self.env is not None and self.module is not None
+
+    @override(EnvRunner)
+    def stop(self) -> None:
+        """Closes the environment."""
+        if self.env is not None:
+            self.env.close()
+
+    @override(Checkpointable)
+    def get_state(
+        self,
+        components: str | Collection[str] | None = None,
+        *,
+        not_components: str | Collection[str] | None = None,
+        **kwargs: Any,
+    ) -> dict[str, Any]:
+        """Weights, step count, and where the copies are in their episodes (if the environment can be pickled)."""
+        state: dict[str, Any] = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self.num_env_steps_sampled_lifetime}
+        if self.module is not None and self._check_component(COMPONENT_RL_MODULE, components, not_components):
+            state[COMPONENT_RL_MODULE] = self.module.get_state(
+                components=self._get_subcomponents(COMPONENT_RL_MODULE, components),
+                not_components=self._get_subcomponents(COMPONENT_RL_MODULE, not_components),
+                **kwargs,
+            )
+            state[WEIGHTS_SEQ_NO] = self._weights_seq_no
+        if self.env is not None and self._check_component(COMPONENT_SAMPLING, components, not_components):
+            state[COMPONENT_SAMPLING] = {
+                "in_evaluation": self.config.in_evaluation,
+                "num_envs": self.num_envs,
+                "env": snapshot(self.env),
+                "acting": self.acting.get_state(),
+                **{name: getattr(self, name) for name in _SAMPLING_STATE},
+            }
+        return state
+
+    @override(Checkpointable)
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a saved state; an environment that could not be saved starts new episodes."""
+        if COMPONENT_RL_MODULE in state and self.module is not None:
+            seq_no = state.get(WEIGHTS_SEQ_NO, 0)
+            if seq_no == 0 or self._weights_seq_no < seq_no:
+                weights = state[COMPONENT_RL_MODULE]
+                # RLlib puts the weights for several remote runners into the object store once.
+                self.module.set_state(ray.get(weights) if isinstance(weights, ray.ObjectRef) else weights)
+            self._weights_seq_no = max(self._weights_seq_no, seq_no)
+        if NUM_ENV_STEPS_SAMPLED_LIFETIME in state:
+            self.num_env_steps_sampled_lifetime = state[NUM_ENV_STEPS_SAMPLED_LIFETIME]
+        sampling = state.get(COMPONENT_SAMPLING)
+        # RLlib hands the training runner's state to the evaluation runner, too; its episodes are not for it.
+        if sampling is None or self.env is None or sampling["in_evaluation"] != self.config.in_evaluation:
+            return
+        if sampling["env"] is None or sampling["num_envs"] != self.num_envs:
+            self._needs_reset = True
+            return
+        self.env = pickle.loads(sampling["env"])
+        self.acting.set_state(sampling["acting"])
+        for name in _SAMPLING_STATE:
+            setattr(self, name, pickle.loads(pickle.dumps(sampling[name])))
+
+    @override(Checkpointable)
+    def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """What builds this runner again."""
+        return (), {"config": self.config}
+
+    @override(Checkpointable)
+    def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:
+        """The agents' modules."""
+        return [(COMPONENT_RL_MODULE, self.module)]
+
+
+_SAMPLING_STATE = ("_obs", "_needs_reset", "_episodes", "_steps_sampled", "_source")

@@ -1,0 +1,36 @@
+"""From a config to the environment copies that a runner steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.env.env_context import EnvContext
+from ray.tune.registry import ENV_CREATOR, _global_registry
+
+from rllib_maobs.envs.joint import WithAgentIds, make_joint_env, register_envs
+from rllib_maobs.envs.team import JointEnv
+
+
+def env_creator(config: AlgorithmConfig) -> Any:
+    """The function that makes the environment of a config from its `env_config`.
+
+    Raises:
+        ValueError: If `config.env` is neither a registered name nor an environment class.
+    """
+    register_envs()  # names are lost when Ray restarts
+    if isinstance(config.env, type):
+        return config.env
+    if isinstance(config.env, str) and _global_registry.contains(ENV_CREATOR, config.env):
+        return _global_registry.get(ENV_CREATOR, config.env)
+    raise ValueError(
+        f"Unknown environment {config.env!r}; legal are {', '.join(sorted(register_envs()))}, a name registered "
+        f"with ray.tune.register_env, or an environment class."
+    )
+
+
+def make_env(config: AlgorithmConfig, num_envs: int, worker_index: int = 0) -> JointEnv:
+    """E copies of a config's environment, see `make_joint_env`."""
+    context = EnvContext(config.env_config or {}, worker_index=worker_index, num_workers=config.num_env_runners)
+    env = make_joint_env(env_creator(config), context, num_envs)
+    return WithAgentIds(env) if config.agent_id_input else env
