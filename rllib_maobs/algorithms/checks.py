@@ -163,8 +163,8 @@ def check_team(config: JointConfig) -> None:
         )
     if team.discrete and config.target_noise:
         raise ValueError(
-            f"target_noise must be 0.0 where actions are discrete, not {config.target_noise}: Gaussian noise can't smooth "
-            f"a one-hot action."
+            f"target_noise must be 0.0 where actions are discrete, not {config.target_noise}: a one-hot action "
+            f"can't be smoothed."
         )
     overrides = config.algorithm_config_overrides_per_module
     if unknown := sorted(set(overrides) - set(config.module_ids)):

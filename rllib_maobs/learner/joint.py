@@ -266,6 +266,41 @@ class JointLearner(TorchLearner):
         if self.has_actors:
             self._draw = torch.rand if team.discrete else torch.randn if config.target_noise else None
         self._generator = torch.Generator().manual_seed(config.seed or 0)
+        self._try_networks()
+
+    @torch.no_grad()
+    def _try_networks(self) -> None:
+        """Calls every network once, so that one that can't be stacked is an error by name before training starts.
+
+        Raises:
+            ValueError: If a network fails, or its result has another shape than it must have.
+        """
+        team, like, rows = self.config.team, self.parts.actors.flat, 2
+        agents, length = len(team.agents), self.config.window_length
+        obs = like.new_zeros(rows, agents, team.observation_size)
+        window = obs.unsqueeze(2).repeat(1, 1, length, 1) if length else None
+        mask = like.new_ones(rows, length) if length else None
+        state = like.new_zeros(rows, self.config.state_size) if self.config.uses_state else None
+        moment, actions = Moment(obs, state, window, mask), like.new_zeros(rows, agents, team.action_size)
+        nets = TeamNetworks(self.parts, self._params_of(self._roles))
+        calls: list[tuple[Stack, Callable[[], Tensor], int]]
+        calls = [(self.parts.actors, lambda: nets.outputs(moment), team.action_size)]
+        if self.parts.critics is not None:
+            calls.append((self.parts.critics, lambda: nets.q(moment, actions), 1 + self.config.twin_critics))
+        for stack, call, width in calls:
+            kinds = ", ".join(dict.fromkeys(type(network).__name__ for network in stack.networks))
+            names = f"{stack.names[0]}{'' if len(stack.names) == 1 else ' and the others'} ({kinds})"
+            try:
+                result = call()
+            except Exception as error:
+                raise ValueError(
+                    f"{names} can't be called for all agents at once by torch.func.vmap: {error}"
+                ) from error
+            if result.shape != (rows, agents, width):
+                raise ValueError(
+                    f"{names} must return {width} numbers in a last dimension; for {agents} agents and a batch of {rows} "
+                    f"that is {(rows, agents, width)}, not {tuple(result.shape)}."
+                )
 
     def stacks(
         self, modules: Sequence[Any], prefix: str, action_mask: Tensor | None, agent_ids: Tensor | None

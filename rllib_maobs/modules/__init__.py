@@ -3,6 +3,7 @@
 from rllib_maobs.modules.actors import ACTORS, Actor, LSTMActor, MLPActor, RecurrentActor
 from rllib_maobs.modules.agent import AgentModule, Seen, UtilityModule
 from rllib_maobs.modules.critics import CRITICS, Critic, MLPCritic
+from rllib_maobs.modules.entity import EntityActor, EntityCritic, EntityLSTMActor
 from rllib_maobs.modules.exploration import EXPLORATIONS, EpsilonGaussian, Exploration, OrnsteinUhlenbeck
 from rllib_maobs.modules.layers import ACTIVATIONS, mlp
 from rllib_maobs.modules.mixer import Mixer, MixerModule
@@ -16,6 +17,9 @@ __all__ = [
     "Actor",
     "AgentModule",
     "Critic",
+    "EntityActor",
+    "EntityCritic",
+    "EntityLSTMActor",
     "EpsilonGaussian",
     "Exploration",
     "LSTMActor",

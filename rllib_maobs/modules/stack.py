@@ -247,8 +247,8 @@ def _check(net: nn.Module, name: str, like: nn.Module | None) -> None:
     """Raises a ValueError if a network can't be stacked."""
     if buffers := [key for key, _ in net.named_buffers()]:
         raise ValueError(
-            f"{name} ({type(net).__name__}) can't be stacked: it has the buffers {buffers} (BatchNorm?). Use LayerNorm, "
-            f"or parameters with requires_grad=False."
+            f"{name} ({type(net).__name__}) can't be stacked: it has the buffers {buffers} (BatchNorm?). Use "
+            f"LayerNorm, or parameters with requires_grad=False."
         )
     parameters = list(net.named_parameters())
     if not parameters:
