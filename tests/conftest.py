@@ -64,7 +64,7 @@ def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Ba
         window = mask = recurrent_state = state = None
         if config.recurrent:
             length = config.seq_length
-            window = normal(size, n, length, o) * present[:, None]
+            window = (normal(size, length, n, o) * present).transpose(1, 2)  # in memory as replay's
             obs = window[:, :, -1]
             # Windows of all lengths: what lies before the first observation is not empty, but does not count.
             count = torch.randint(1, length + 1, (size, 1), generator=generator)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from rllib_maobs.replay import Batch, Moment
+from tests import entities
 
 Layers = list[Tensor]  # weight, bias, weight, bias, ...
 
@@ -55,6 +56,7 @@ class Equations:
         self.sizes, self.actions = team.observation_sizes, team.action_sizes
         self.discrete, self.name = team.discrete, self.config.name
         modules = {mid: learner.module[mid] for mid in self.config.module_ids}
+        self.modules = [modules[mid] for mid in self.config.module_ids]
         kinds = ["utility"] if hasattr(next(iter(modules.values())), "utility") else ["actor", "critic"]
         self.nets: dict[str, list[Layers]] = {}
         self.optimizers: dict[str, torch.optim.Adam] = {}
@@ -82,10 +84,37 @@ class Equations:
 
     def output(self, kind: str, moment: Moment, row: int, agent: int) -> Tensor:
         observations, layers = self.seen(moment, row, agent), self.nets[kind][agent]
+        if self.config.actor.startswith("entity"):
+            return self.entity_output(kind, layers, observations, agent)
         if self.config.actor == "mlp":
             return mlp(layers, observations[-1])
         start = None if moment.recurrent_state is None else moment.recurrent_state[row, agent]
         return lstm(layers, observations, start)
+
+    def entity_output(self, kind: str, layers: Layers, observations: Tensor, agent: int) -> Tensor:
+        network = getattr(self.modules[agent], kind)
+        p = dict(zip(dict(network.named_parameters()), layers, strict=True))
+        seen = [entities.ego(p, "ego", network.layout, x, None) for x in observations]
+        if self.config.actor == "entity":
+            return entities.layers(p, "layers", seen[-1])
+        encoded = torch.stack([entities.layers(p, "encoder", x).clamp(min=0.0) for x in seen])
+        names = ("from_observation.weight", "from_observation.bias", "from_hidden.weight")
+        rest = [tensor for name, tensor in p.items() if name.startswith("layers.")]
+        return lstm([*(p[name] for name in names), *rest], encoded, None)
+
+    def entity_critic(self, layers: Layers, x: Tensor, u: Tensor, agent: int) -> Tensor:
+        network = self.modules[agent].critic
+        p = dict(zip(dict(network.named_parameters()), layers, strict=True))
+        values = []
+        for c in range(network.num_critics):
+            if self.config.central_critic:
+                joint = "joint_action" in self.config.critic_sees
+                count = len(self.agents)
+                view = entities.world(p, f"views.{c}", network.state_layout, x, u, agent, count, joint)
+            else:
+                view = entities.ego(p, f"views.{c}", network.state_layout, x, u)
+            values.append(entities.layers(p, f"layers.{c}", view))
+        return torch.cat(values)
 
     def state(self, moment: Moment, row: int) -> Tensor:
         if moment.state is not None:
@@ -115,6 +144,10 @@ class Equations:
 
     def q(self, kind: str, moment: Moment, row: int, agent: int, joint: list[Tensor]) -> Tensor:
         """Q of one agent's critics in the joint action, one for each of its twins."""
+        if self.config.critic == "entity":
+            seen = self.seen(moment, row, agent)[-1] if self.name == "iddpg" else self.state(moment, row)
+            u = torch.cat(joint) if "joint_action" in self.config.critic_sees else joint[agent]
+            return self.entity_critic(self.nets[kind][agent], seen, u, agent)
         ids = self.config.agent_id_input and self.config.uses_state
         own = [torch.eye(len(self.agents))[agent]] if ids else []
         if self.name == "iddpg":
@@ -212,6 +245,8 @@ class Equations:
         own = self.config.critic_source == "own"
 
         def local(kind: str, judge: int, judged: int, u: Tensor, moment: Moment) -> Tensor:
+            if self.config.critic == "entity":
+                return self.entity_critic(self.nets[kind][judge], self.seen(moment, row, judged)[-1], u, judged)[0]
             x = torch.cat([self.seen(moment, row, judged)[-1], u])
             return self.critic(self.nets[kind][judge], x)[0]
 

@@ -35,7 +35,7 @@ def ddpg(algorithm: str, others: str) -> maobs.JointConfig:
 
 
 def per_network(views: list[torch.Tensor], stack: Stack) -> dict[str, dict[str, torch.Tensor]]:
-    """A stack's gradient by name for each distinct network; a critic's first weight, kept in two parts, put together."""
+    """A stack's gradient by name for each distinct network; a critic's first weight, in two parts, put together."""
     params = stack.unflatten(torch.cat(views))
     result: dict[int, tuple[str, dict[str, torch.Tensor]]] = {}
     for agent, name in enumerate(stack.names):
@@ -75,6 +75,8 @@ def learned_prey(config: maobs.JointConfig) -> maobs.JointConfig:
 
 
 TD3 = {"twin_critics": True, "target_noise": 0.2, "target_noise_clip": 0.3}
+ENTITY = {"actor": "entity", "critic": "entity", "critic_state": "world"}
+OTHERS = ("replay", "current", "joint")
 CARRIED = "h and c stored"
 # Algorithm, settings, further changes; the name of the case.
 CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
@@ -102,6 +104,16 @@ CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
     **{f"{a}, learned prey": (a, {}, [learned_prey]) for a in (*FAMILY, "maddpg-lstm")},
     f"maddpg-lstm, learned prey, {CARRIED}": ("maddpg-lstm", {"stored_state": True}, [learned_prey]),
     f"maddpg-lstm, one policy, {CARRIED}": ("maddpg-lstm", {"stored_state": True}, [one_policy]),
+    **{f"maddpg, entities, {o}": ("maddpg", {**ENTITY, "other_agents_actions": o}, []) for o in OTHERS},
+    **{f"{a}, entities": (a, ENTITY, []) for a in ("iddpg", "maddpg-l", "facmac")},
+    **{f"{a}, entities": (a, {"actor": "entity"}, []) for a in ("iql", "vdn", "qmix")},
+    **{f"{a}, entities, one policy": (a, ENTITY, [one_policy]) for a in (*FAMILY, "facmac")},
+    **{f"{a}, entities, TD3": (a, {**ENTITY, **TD3}, []) for a in ("iddpg", "maddpg")},
+    **{f"{a}, entities, discrete": (a, ENTITY, [discrete]) for a in ("maddpg-l", "facmac")},
+    **{f"{a}, entities, learned prey": (a, ENTITY, [learned_prey]) for a in ("iddpg", "maddpg")},
+    "facmac own, entities": ("facmac", {**ENTITY, "critic_source": "own"}, []),
+    "maddpg, LSTM over entities": ("maddpg", {**ENTITY, "actor": "entity-lstm"}, []),
+    "qmix, LSTM over entities, one policy": ("qmix", {"actor": "entity-lstm"}, [one_policy]),
     "maddpg-l, learned prey with ids": ("maddpg-l", {"agent_id_input": True}, [learned_prey]),
 }
 
@@ -142,7 +154,7 @@ def compare(learner: JointLearner, batch: Batch, stage: str = "") -> None:
 @pytest.mark.usefixtures("double_precision")
 def test_losses_and_gradients_equal_the_equations(make_learner: MakeLearner, case: str) -> None:
     learner = make_learner(configured(case))
-    compare(learner, random_batch(learner.config, size=12))
+    compare(learner, random_batch(learner.config, size=2 if "entities" in case else 12))
 
 
 @pytest.mark.parametrize("source", ["shared", "others", "own"])

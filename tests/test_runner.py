@@ -144,9 +144,9 @@ def test_exploration_decays_as_in_the_paper() -> None:
     assert uniform == pytest.approx(0.1 * (1 - 0.5**5), abs=0.005)
     quiet = EpsilonGaussian(epsilon=0.0, noise=0.1)(greedy, 0, generator)
     assert (quiet - 0.5).std().item() == pytest.approx(0.1, abs=0.002)
-    with pytest.raises(ValueError, match="has no setting 'sigma'; legal are epsilon, noise, decay, final"):
+    with pytest.raises(ValueError, match=r"has no setting 'sigma'; legal are epsilon, noise, decay, final"):
         make_exploration({"sigma": 0.1})
-    with pytest.raises(ValueError, match="EpsilonGaussian: epsilon=1.5 is illegal; legal: a number >= 0 and <= 1"):
+    with pytest.raises(ValueError, match=r"EpsilonGaussian: epsilon=1\.5 is illegal; legal: a number >= 0 and <= 1"):
         make_exploration({"epsilon": 1.5})
 
 

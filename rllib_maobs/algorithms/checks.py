@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
+import torch
 from ray.rllib.policy.policy import PolicySpec
 
 from rllib_maobs.envs.team import Team, shares_reward
@@ -184,9 +185,13 @@ def check_team(config: JointConfig) -> None:
 
 
 def check_layouts(config: JointConfig) -> None:
-    """Builds what the critics see once, so that a layout which does not fit is an error now."""
-    for agent in config.team.agents:
-        config.critic_layouts(agent)
+    """Builds every policy's networks once, so that one which can't do with its layout is an error now."""
+    team = config.team
+    spaces = {mid: team.spaces(agent) for agent, mid in zip(team.agents, config.module_ids, strict=True)}
+    specs = config.get_multi_rl_module_spec(spaces=spaces).rl_module_specs
+    with torch.random.fork_rng(devices=[]):  # the run's own networks start as if there had been no check
+        for spec in specs.values():
+            spec.build()
 
 
 def agent_groups(config: JointConfig, state: Layout) -> list[tuple[str, int]]:

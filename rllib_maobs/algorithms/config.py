@@ -10,6 +10,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.utils.annotations import override
+from ray.util import log_once
 
 from rllib_maobs.algorithms import checks
 from rllib_maobs.envs.team import Team
@@ -265,6 +266,8 @@ class JointConfig(AlgorithmConfig):
         self.module_ids = checks.map_policies(self)
         checks.check_team(self)
         checks.check_layouts(self)
+        # RLlib would say, once, that its old API stack is a choice, too; here it is none.
+        log_once(f"{getattr(self.algo_class, '__name__', '')}_on_new_api_stack")
         super().validate()
 
     @override(AlgorithmConfig)

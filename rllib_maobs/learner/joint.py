@@ -298,8 +298,8 @@ class JointLearner(TorchLearner):
                 ) from error
             if result.shape != (rows, agents, width):
                 raise ValueError(
-                    f"{names} must return {width} numbers in a last dimension; for {agents} agents and a batch of {rows} "
-                    f"that is {(rows, agents, width)}, not {tuple(result.shape)}."
+                    f"{names} must return {width} numbers in a last dimension; for {agents} agents and a batch of "
+                    f"{rows} that is {(rows, agents, width)}, not {tuple(result.shape)}."
                 )
 
     def stacks(

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import torch
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.learner.utils import make_target_network
@@ -14,7 +15,7 @@ from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
 from ray.rllib.utils.annotations import override
 from torch import Tensor, nn
 
-from rllib_maobs.layout import Layout, as_layout, flat
+from rllib_maobs.layout import Layout, as_layout, flat, layout_size
 from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor
 from rllib_maobs.modules.critics import CRITICS, Critic
 from rllib_maobs.modules.exploration import make_exploration
@@ -183,6 +184,42 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         if self.stored_state and isinstance(acting, RecurrentActor):
             state["recurrent_state"] = acting.initial_state()
         return state
+
+    def for_layout(self, layout: Layout) -> AgentModule:
+        """This agent for a team of another size: the same networks that act, made for another observation.
+
+        ```python
+        env = maobs.make_vec("spread-9a")
+        module = module.for_layout(env.observation_layouts["agent_0"])
+        ```
+
+        Args:
+            layout: What the observation is made of there.
+
+        Returns:
+            A module that acts; it has copies of the weights, and no critic.
+
+        Raises:
+            ValueError: If the network's parameters depend on the layout, as an MLP's do.
+        """
+        size = layout_size(layout)
+        settings = {**self.model_config, "observation_layout": [list(group) for group in layout]}
+        other = type(self)(
+            observation_space=gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
+            action_space=self.action_space,
+            inference_only=True,
+            model_config=settings,
+        )
+        own = {name: tuple(p.shape) for name, p in self.acting.named_parameters()}
+        if own != {name: tuple(p.shape) for name, p in other.acting.named_parameters()}:
+            raise ValueError(
+                f"{type(self.acting).__name__} of this agent has parameters of other shapes for an observation of "
+                f"{[tuple(group) for group in layout]}: entity networks do not."
+            )
+        other.acting.load_state_dict(self.acting.state_dict())
+        if list(self.normalizer.parameters()):
+            raise ValueError("An agent with normalize_observations=True has statistics for one observation only.")
+        return other
 
     def greedy(self, outputs: Tensor) -> Tensor:
         """The policy's own actions: tanh of raw outputs `(..., A)`, or if discrete the best one's number `(...)`."""

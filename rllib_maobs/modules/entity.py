@@ -121,8 +121,8 @@ class Ego(nn.Module):
         own = layout_size(tuple(group for group in layout if not group.position)) + extra
         self.around = [group.name for group in around]
         self.position = {group.name: group.position for group in around}
-        self.mates = [group for group in around if group.name in agents and group.count]
-        self.listeners = [group.name for group in around if group.name not in (*agents, *deaf) and self.mates]
+        self.mates = [group for group in around if group.name in agents]
+        self.listeners = [group.name for group in around if group.name not in (*agents, *deaf)]
         space = around[0].position
         rest = {group.name: group.size - group.position for group in around}
         self.heard = nn.ModuleDict(
@@ -347,13 +347,14 @@ class EntityCritic(Critic):
         deaf: Sequence[str] = DEAF,
     ) -> None:
         super().__init__(state_layout, action_layout, num_critics, num_agents)
-        self.views: nn.ModuleList = nn.ModuleList(
+        views: list[World | Ego] = [
             World(state_layout, action_layout, num_agents, edge, deaf)
             if num_agents
             else Ego(state_layout, layout_size(action_layout), edge, agents, deaf)
             for _ in range(num_critics)
-        )
-        self.layers = nn.ModuleList(mlp((view.size, node, node, 1)) for view in self.views)
+        ]
+        self.views = nn.ModuleList(views)
+        self.layers = nn.ModuleList(mlp((view.size, node, node, 1)) for view in views)
 
     def forward(self, state: Tensor, action: Tensor, agent: Tensor | None = None) -> Tensor:
         """Q of every critic: `(..., S)` and `(..., A)` to `(..., C)`."""
@@ -376,8 +377,9 @@ def leading(state_layout: Layout, num_agents: int) -> list[Entities]:
         found += group.count
     if found != num_agents or len({group[2:] for group in groups}) > 1 or not groups[0].position:
         raise ValueError(
-            f"An entity critic needs a state whose first groups are the {num_agents} agents, with a position and of one "
-            f"size, not {[tuple(group) for group in state_layout]}."
+            f"An entity critic needs a state whose first groups are the {num_agents} agents, with a position and of "
+            f'one size, not {[tuple(group) for group in state_layout][:4]}: critic_state="world" of an environment that '
+            f'says what its state is made of, or training(state_layout=[("agent", {num_agents}, 4, 2), ...]).'
         )
     return groups
 
@@ -386,9 +388,9 @@ def check_entities(around: Sequence[Entities], what: str) -> None:
     """Raises a ValueError if there are no entities with a position; shows how to write a layout."""
     if not around or len({group.position for group in around}) > 1:
         raise ValueError(
-            f"Entity networks need {what} that says where things are: groups (name, count, size, position), where the first "
-            f'`position` numbers of each entity are its place, the same number in all groups, e.g. [("self", 1, 4), '
-            f'("target", 3, 2, 2), ("obstacle", 2, 2, 2), ("agent", 2, 2, 2)]. Give observation_layouts (and with a '
+            f"Entity networks need {what} that says where things are: groups (name, count, size, position), where the "
+            f"first `position` numbers of each entity are its place, the same number in all groups, e.g. "
+            f'[("self", 1, 4), ("target", 3, 2, 2), ("agent", 2, 2, 2)]. Give observation_layouts (and with a '
             f'centralised critic critic_state="world" and state_layout) to config.training().'
         )
 

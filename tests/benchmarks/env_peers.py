@@ -13,24 +13,19 @@ per call, as a training loop with a policy outside of JAX calls it, and also 100
 """
 
 import argparse
-import json
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from tests.benchmarks.measure import count, in_turns
+from tests.benchmarks.workers import Job, Worker, free_cores, python_with, same_torch
 
 HORIZON = 100
 ROUNDS = 4
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "JAX_PLATFORMS": "cpu",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
 PEERS = ["vmas==1.5.2", "jaxmarl==0.2.0", "jax==0.10.2", "jaxlib==0.10.2"]
 Episode = Callable[[], None]
 
@@ -101,10 +96,8 @@ def jaxmarl_episode(agents: int, copies: int, in_one_call: bool) -> Episode:
     return episode
 
 
-def serve(name: str, agents: int, copies: int) -> None:
-    """Be a worker: for every line of input (seconds) play as long and print environment steps per second."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, [max(os.sched_getaffinity(0))])  # XLA starts threads whatever its flags say
+def prepare(name: str, agents: int, copies: int) -> Job:
+    """Be the target of a worker: play an episode, which compiles; measured are environment steps per second."""
     episode = {
         "ours": lambda: our_episode(agents, copies, obstacles=0),
         "ours-obstacles": lambda: our_episode(agents, copies, obstacles=2 * agents // 3),
@@ -112,29 +105,13 @@ def serve(name: str, agents: int, copies: int) -> None:
         "jaxmarl": lambda: jaxmarl_episode(agents, copies, in_one_call=False),
         "jaxmarl-scan": lambda: jaxmarl_episode(agents, copies, in_one_call=True),
     }[name]()
-    episode()  # compiles
-    print("ready", flush=True)
-    for line in sys.stdin:
-        episodes, start = 0, time.perf_counter()
-        while time.perf_counter() - start < float(line):
-            episode()
-            episodes += 1
-        print(json.dumps(episodes * HORIZON * copies / (time.perf_counter() - start)), flush=True)
+    episode()
 
+    def work() -> int:
+        episode()
+        return HORIZON * copies
 
-def python_of_peers(folder: Path) -> str:
-    """Return the interpreter of the virtual environment, which is made if need be."""
-    python = folder / "bin" / "python"
-    done = folder / "installed"
-    if not done.exists() or done.read_text() != str(PEERS):
-        print(f"making {folder} with {', '.join(PEERS)} ...", flush=True)
-        subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder)], check=True)
-        # PyTorch on its own first, so that it is the build that this package runs on; VMAS needs the old gym, whose
-        # set-up does not run with the newest setuptools.
-        for packages in (["setuptools<80", f"torch=={version('torch').partition('+')[0]}"], PEERS):
-            subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
-        done.write_text(str(PEERS))
-    return str(python)
+    return Job(lambda seconds: count(work, seconds).rate)
 
 
 def main() -> None:
@@ -144,37 +121,24 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=4.0, help="per row, over all rounds")
     parser.add_argument("--venv", type=Path, default=Path(tempfile.gettempdir()) / "rllib-maobs-peers")
-    parser.add_argument("--serve", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.serve:
-        serve(args.serve, args.agents, args.copies)
-        return
-    peers = python_of_peers(args.venv)
-    names = {"ours": sys.executable, "ours-obstacles": sys.executable, "vmas": peers, "jaxmarl": peers}
-    names["jaxmarl-scan"] = peers
-    size = ["--agents", str(args.agents), "--copies", str(args.copies)]
+    # PyTorch on its own first, so that it is the build that this package runs on; VMAS needs the old gym, whose
+    # set-up does not run with the newest setuptools.
+    peers = python_with(args.venv, ["setuptools<80", same_torch()], PEERS)
+    pythons = {"ours": sys.executable, "ours-obstacles": sys.executable, "vmas": peers, "jaxmarl": peers}
+    pythons["jaxmarl-scan"] = peers
+    core = free_cores()[-1:]  # XLA starts threads whatever its flags say
     workers = {
-        name: subprocess.Popen(
-            [python, __file__, "--serve", name, *size],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | ONE_THREAD,
-        )
-        for name, python in names.items()
+        name: Worker("tests.benchmarks.env_peers:prepare", name, args.agents, args.copies, cores=core, python=python)
+        for name, python in pythons.items()
     }
-    best = dict.fromkeys(workers, 0.0)
     for worker in workers.values():
-        assert worker.stdout is not None
-        while worker.stdout.readline() not in ("ready\n", ""):
-            pass  # what libraries print when they are imported
-    for _ in range(ROUNDS):
-        for name, worker in workers.items():
-            assert worker.stdin is not None and worker.stdout is not None
-            print(args.seconds / ROUNDS, file=worker.stdin, flush=True)
-            best[name] = max(best[name], json.loads(worker.stdout.readline()))
+        worker.ready()
+    seconds = args.seconds / ROUNDS
+    rates = in_turns({name: partial(worker.measured, seconds) for name, worker in workers.items()}, ROUNDS)
     for worker in workers.values():
-        worker.communicate()
+        worker.close()
+    best = {name: max(own) for name, own in rates.items()}
     print(f"Spread, {args.agents} agents, {args.copies} copies, one thread, episodes of {HORIZON} steps")
     print(f"{'':>16} {'env steps/s':>12} {'ours / it':>10}")
     for name, speed in best.items():

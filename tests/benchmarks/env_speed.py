@@ -9,13 +9,19 @@ counts. Below the table: what an agent costs in a team three times as large, in 
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from mpe2 import simple_spread_v3
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 from rllib_maobs.envs import MAObsParallelEnv, VectorEnv, make_vec, parallel_env
+from tests.benchmarks.measure import count, in_turns
 
 HORIZON = 100
 COPIES = (1, 8, 64)
@@ -57,21 +63,21 @@ def mpe2_episode(env: object, actions: np.ndarray) -> float:
 
 def measure(episode: Callable[[], float], copies: int, seconds: float) -> tuple[float, float]:
     """Return environment steps per second and the share of time in resets."""
-    episodes, resets, start = 0, 0.0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    resets = 0.0
+
+    def work() -> int:
+        nonlocal resets
         resets += episode()
-        episodes += 1
-    total = time.perf_counter() - start
-    return episodes * HORIZON * copies / total, resets / total
+        return HORIZON * copies
+
+    played = count(work, seconds)
+    return played.rate, resets / played.seconds
 
 
 def take_turns(rows: dict[str, Row], seconds: float) -> dict[str, tuple[float, float]]:
     """Return the best round of each row: steps per second and the share of resets."""
-    best = dict.fromkeys(rows, (0.0, 0.0))
-    for _ in range(ROUNDS):
-        for name, (copies, episode) in rows.items():
-            best[name] = max(best[name], measure(episode, copies, seconds / ROUNDS))
-    return best
+    ways = {name: partial(measure, episode, copies, seconds / ROUNDS) for name, (copies, episode) in rows.items()}
+    return {name: max(own) for name, own in in_turns(ways, ROUNDS).items()}
 
 
 def vector_row(copies: int, actions: np.ndarray, scenario: str, **options: object) -> Row:

@@ -20,16 +20,11 @@ the numbers say little.
 """
 
 import argparse
-import contextlib
-import io
-import json
+import itertools
 import math
-import os
 import statistics
-import subprocess
 import sys
-import tempfile
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +32,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from tests.benchmarks.measure import Stopwatch, best, count, end, in_turns, row
+from tests.benchmarks.workers import ROOT, Job, Worker, free_cores
+
 TEAMS, COPIES, RUNNERS = [3, 6, 9, 18, 27], [1, 2, 4, 8, 16, 32], [0, 1, 2]
 CRITICS = [(algorithm, state) for algorithm in ("maddpg", "maddpg-l") for state in ("observations", "world")]
 HARDLY = 0.01  # updates per env step where sampling is measured
@@ -57,118 +56,93 @@ class Cell(NamedTuple):
     updates: float = 1.0
 
 
-def measured_update(config: Any) -> Any:
-    """Compile the update alone; return a function that measures it and its limit."""
-    from tests.benchmarks.grid import best, limit
-    from tests.conftest import build_learner, random_columns
+def update_job(config: Any) -> Job:
+    """Compile the update alone; measured are it and its limit."""
+    from tests.benchmarks.internals import number_of_parameters, update_of
+    from tests.benchmarks.limit import limit
+    from tests.conftest import build_learner, random_batch
 
     learner = build_learner(config)
-    columns = random_columns(config)
-    parameters = sum(stack.flat.numel() for stack in learner._roles.values())
+    batch = random_batch(config)
+    update = update_of(learner, batch)
 
     def measure(seconds: float) -> dict[str, float]:
-        update = best(lambda: learner.step(columns), seconds)
-        return {"update": update, "limit": limit(learner, columns), "parameters": parameters}
+        fastest = best(update, seconds)
+        return {"update": fastest, "limit": limit(learner, batch), "parameters": number_of_parameters(learner)}
 
-    return measure
+    return Job(measure)
 
 
-def measured_train(config: Any) -> Any:
-    """Start Ray and compile; return a function that measures `train()`, and the seconds of an update in it."""
+def train_job(config: Any) -> Job:
+    """Start Ray and compile; measured are `train()`, and the seconds of an update in it."""
     import ray
 
-    from tests.benchmarks.grid import Clock
+    from tests.benchmarks.internals import watch_update
 
     ray.init(address="local", num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    algo, clock = config.build_algo(), Clock()
-    algo.train()
-    clock.watch("update", algo._learner, "step")
+    algo, stopwatch = config.build_algo(), Stopwatch()
+    sampled = algo.train()["num_env_steps_sampled_lifetime"]
+    watch_update(algo, stopwatch)
+
+    def train() -> int:
+        nonlocal sampled
+        before, sampled = sampled, algo.train()["num_env_steps_sampled_lifetime"]
+        return int(sampled - before)
 
     def measure(seconds: float) -> dict[str, float]:
-        clock.seconds.clear()
-        before, start = algo._progress["env_steps"], time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            algo.train()
-        total, steps = time.perf_counter() - start, algo._progress["env_steps"] - before
-        return {"rate": steps / total, "update": clock.seconds["update"] / steps}
+        stopwatch.seconds.clear()
+        trained = count(train, seconds)
+        return {"rate": trained.rate, "update": stopwatch.seconds["update"] / trained.made}
 
-    return measure
+    return Job(measure)
 
 
-def serve(cell: Cell) -> None:
-    """Be a worker: compile, then for every line of input (seconds) print what was measured."""
-    sys.path.insert(0, str(ROOT))
+def prepare(*cell: Any) -> Job:
+    """Be the target of a worker: build a configuration and measure once, for a moment."""
     from tests.benchmarks.update_speed import config_of
 
-    room = max(1.0, math.sqrt(cell.agents / 9))  # as much for each as nine have
-    options = {"num_agents": cell.agents, "num_obstacles": 2 * cell.agents // 3}
+    own = Cell(*cell)
+    room = max(1.0, math.sqrt(own.agents / 9))  # as much for each as nine have
+    options = {"num_agents": own.agents, "num_obstacles": 2 * own.agents // 3}
     options |= {"agent_range": room, "obstacle_range": 0.9 * room}
-    config = config_of(cell.algorithm, "N=9 batch 32", cell.state).environment(env_config=options)
-    config.env_runners(num_env_runners=cell.runners, num_envs_per_env_runner=cell.copies)
-    config.training(updates_per_env_step=cell.updates)
-
-    answers = sys.stdout
-    with contextlib.redirect_stdout(io.StringIO()):
-        measure = (measured_update if cell.update else measured_train)(config)
-        measure(0.1)
-        print("ready", file=answers, flush=True)
-        for line in sys.stdin:
-            start, cpu = time.perf_counter(), time.process_time()
-            result = measure(float(line))
-            share = (time.process_time() - cpu) / (time.perf_counter() - start)
-            print(json.dumps({**result, "share of a core": share}), file=answers, flush=True)
+    config = config_of(own.algorithm, "N=9 batch 32", own.state).environment(env_config=options)
+    config.env_runners(num_env_runners=own.runners, num_envs_per_env_runner=own.copies)
+    config.training(updates_per_env_step=own.updates)
+    job = (update_job if own.update else train_job)(config)
+    job.measure(0.1)
+    return job
 
 
-class Worker:
-    """A configuration in a process of its own."""
+def worker_of(cell: Cell, cores: set[int]) -> Worker:
+    """Start a configuration in a process of its own."""
+    return Worker("tests.benchmarks.scaling:prepare", *cell, cores=cores)
 
-    def __init__(self, cell: Cell, cores: set[int]) -> None:
-        self.cell, self.log = cell, tempfile.TemporaryFile("w+")
-        self.process = subprocess.Popen(
-            [sys.executable, __file__, "--cell", json.dumps(cell)],
-            env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"},
-            preexec_fn=lambda: os.sched_setaffinity(0, cores),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self.log,
-            text=True,
-        )
 
-    def ask(self, seconds: float) -> None:
-        """Let it measure."""
-        print(seconds, file=self.process.stdin, flush=True)
-
-    def answer(self) -> Any:
-        """Wait for what it says: first that it is ready, then what it measured."""
-        line = self.process.stdout.readline()
-        if not line:
-            self.log.seek(0)
-            raise RuntimeError(f"{self.cell} failed:\n{self.log.read()[-4000:]}")
-        if line == "ready\n":
-            return None
-        result = json.loads(line)
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in result.items())
-        print(f"{self.cell}: {numbers}", file=sys.stderr, flush=True)
-        return result
+def answer(cell: Cell, worker: Worker) -> dict[str, float]:
+    """Wait for what a configuration's process measured."""
+    result: dict[str, float] = worker.answer()
+    numbers = ", ".join(f"{name} {value:.3g}" for name, value in {**result, "share of a core": worker.share}.items())
+    print(f"{cell}: {numbers}", file=sys.stderr, flush=True)
+    return result
 
 
 def run(cells: list[Cell], cores: list[set[int]], seconds: float) -> dict[Cell, dict[str, float]]:
     """Measure cells one at a time, after as many as there are sets of cores have been compiled at once."""
     results = {}
     for first in range(0, len(cells), len(cores)):
-        workers = [Worker(cell, own) for cell, own in zip(cells[first:], cores, strict=False)]
-        for worker in workers:
-            worker.answer()
-        for worker in workers:
+        workers = {cell: worker_of(cell, own) for cell, own in zip(cells[first:], cores, strict=False)}
+        for worker in workers.values():
+            worker.ready()
+        for cell, worker in workers.items():
             worker.ask(seconds)
-            results[worker.cell] = worker.answer()
-            worker.process.communicate()
+            results[cell] = answer(cell, worker)
+            worker.close()
     return results
 
 
 def table(header: list[str], rows: list[list[str]]) -> None:
     """Print a table in Markdown."""
-    print("\n" + "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows)), flush=True)
+    print("\n" + "\n".join(map(row, (header, ["---"] * len(header), *rows))), flush=True)
 
 
 def with_exponents(values: list[float], cells: list[str]) -> list[str]:
@@ -246,17 +220,20 @@ def runners(cores: list[int], seconds: float, axes: Axes) -> list[str]:
 
 def two(cores: list[int], seconds: float, axes: Axes) -> list[str]:
     """Two trials at once against one alone; returns the bar if it is missed."""
-    workers = [Worker(Cell(), {core}) for core in cores]
+    workers = [worker_of(Cell(), {core}) for core in cores]
     for worker in workers:
-        worker.answer()
-    rates: list[list[float]] = [[], []]  # of one alone, and of two at once
-    for index in range(ROUNDS):
-        for own, at_once in zip(rates, ([workers[index % 2]], workers), strict=True):
-            for worker in at_once:
-                worker.ask(seconds)
-            own.append(sum(worker.answer()["rate"] for worker in at_once))
+        worker.ready()
+
+    def rate(at_once: list[Worker]) -> float:
+        for worker in at_once:
+            worker.ask(seconds)
+        return sum(answer(Cell(), worker)["rate"] for worker in at_once)
+
+    alone = itertools.cycle(workers)
+    ways = {"one": lambda: rate([next(alone)]), "both": partial(rate, workers)}
+    rates = list(in_turns(ways, ROUNDS).values())
     for worker in workers:
-        worker.process.communicate()
+        worker.close()
     one, both = map(statistics.median, rates)
     values = [("1", one, "1"), ("2", both, f"{both / one:.2f}")]
     rows = [[n, f"{m:.0f}", f"{min(r):.0f} to {max(r):.0f}", x] for (n, m, x), r in zip(values, rates, strict=True)]
@@ -277,11 +254,8 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--seconds", type=float, default=4.0, help="per measurement")
     parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "media" / "scaling.png", help="the figure's file")
-    parser.add_argument("--cell", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.cell:
-        return serve(Cell(*json.loads(arguments.cell)))
-    cores = sorted(os.sched_getaffinity(0))[:2]
+    cores = free_cores()[:2]
     if "two" in arguments.parts and len(cores) < 2:
         parser.error("--parts: two trials at once need two cores, and this process may use one")
 
@@ -292,9 +266,7 @@ def main() -> None:
     for index, part in enumerate(arguments.parts):
         missed += PARTS[part](cores, arguments.seconds, figure.add_subplot(*size, index + 1))
     figure.savefig(arguments.plot, dpi=150)
-    for bar in missed:
-        print(f"below the bar: {bar}")
-    sys.exit(bool(missed))
+    end(missed)
 
 
 if __name__ == "__main__":

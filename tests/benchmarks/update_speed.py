@@ -14,7 +14,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import ray
@@ -23,18 +23,15 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import JointLearner
-from rllib_maobs.terms import Columns
-from tests.conftest import build_learner, random_columns
-from tests.reference import LoopLearner
+from tests.benchmarks.internals import LOOPS, learner_of, loop_update_of, minibatch, needs_discrete, update_of
+from tests.benchmarks.measure import Work, count, in_turns, median_ratio, row
+from tests.conftest import build_learner, random_batch
 
 # Environment, batch size, sequence length, and least ratios: compiled to the loop, end to end to compiled.
 SHAPES = {
     "N=9 batch 32": ("maobs/spread-9a", 32, 3, 6.0, 0.75),
     "N=3 batch 128": ("maobs/spread-3a", 128, 5, 3.5, 0.75),
 }
-# What the loop over agents can learn.
-LOOPS = ("iddpg", "maddpg", "maddpg-l")
 # Least updates of the compiled learner for one of MADDPG's.
 AGAINST_MADDPG = {"maddpg-lstm": 0.3, "facmac": 0.7, "qmix": 0.7}
 
@@ -43,45 +40,10 @@ def config_of(algorithm: str, shape: str, critic_state: str, compiled: bool = Tr
     """The paper's settings without evaluation."""
     env, batch_size, seq_length, *_ = SHAPES[shape]
     config = maobs.ALGORITHMS[algorithm]()
-    discrete = config.abilities.actions == ("discrete",)
-    config.environment(env, env_config={"action_mode": "discrete"} if discrete else {})
+    config.environment(env, env_config={"action_mode": "discrete"} if needs_discrete(config) else {})
     config.training(train_batch_size_per_learner=batch_size, replay_buffer_capacity=50_000, critic_state=critic_state)
     config.training(seq_length=seq_length).framework(torch_compile_learner=compiled)
     return config.reporting(min_sample_timesteps_per_iteration=400).debugging(seed=0)
-
-
-def rate(work: Callable[[], int], seconds: float) -> float:
-    """Calls `work`, which returns how many updates it made, for some seconds; updates per second."""
-    count, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        count += work()
-    return count / (time.perf_counter() - start)
-
-
-def loop_update(algorithm: str, learner: JointLearner, columns: Columns) -> Callable[[], int]:
-    """An update of the loop over agents."""
-    config, team = learner.config, learner.config.team
-    sizes = (len(team.agents), team.observation_size, team.action_size, config.state_size)
-    loop = LoopLearner(algorithm, *sizes)
-    batch = learner.prepare(columns, {})._asdict()
-    sample = {name: value for name, value in batch.items() if isinstance(value, torch.Tensor)}
-    sample["terminated"] = (sample.pop("discount") == 0).float()
-
-    def update() -> int:
-        loop.update(sample)
-        return 1
-
-    return update
-
-
-def stacked_update(learner: JointLearner, columns: Columns) -> Callable[[], int]:
-    """An update of ours."""
-
-    def update() -> int:
-        learner.step(columns)
-        return 1
-
-    return update
 
 
 def measure(algorithm: str, shape: str, critic_state: str, rounds: int, seconds: float) -> dict[str, float]:
@@ -91,31 +53,29 @@ def measure(algorithm: str, shape: str, critic_state: str, rounds: int, seconds:
     algo = config_of(algorithm, shape, critic_state).build_algo()
     algo.train()
     first = time.perf_counter() - start
-    columns = random_columns(algo.config, SHAPES[shape][1])
+    batch = minibatch(algo, SHAPES[shape][1])  # Laid out in memory like those that it was compiled for.
     maddpg = build_learner(config_of("maddpg", shape, critic_state))
 
     def train() -> int:
         algo.train()
         return 400
 
-    ways: dict[str, Callable[[], int]] = {
-        "eager": stacked_update(eager, columns),
-        "compiled": stacked_update(algo._learner, columns),
-        "maddpg": stacked_update(maddpg, random_columns(maddpg.config, SHAPES[shape][1])),
+    ways: dict[str, Work] = {
+        "eager": update_of(eager, batch),
+        "compiled": update_of(learner_of(algo), batch),
+        "maddpg": update_of(maddpg, random_batch(maddpg.config, SHAPES[shape][1])),
         "end to end": train,
     }
     if algorithm in LOOPS:
-        ways["loop"] = loop_update(algorithm, eager, columns)
+        ways["loop"] = loop_update_of(algorithm, eager, batch)
     for work in ways.values():
         work()
-    rates: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(rounds):
-        for name, work in ways.items():
-            rates[name].append(rate(work, seconds))
+    counts = in_turns({name: partial(count, work, seconds) for name, work in ways.items()}, rounds)
+    rates = {name: [one.rate for one in own] for name, own in counts.items()}
     algo.stop()
 
     def ratio(a: str, b: str) -> float:
-        return statistics.median(x / y for x, y in zip(rates[a], rates[b], strict=True)) if b in rates else math.nan
+        return median_ratio(rates[a], rates[b]) if b in rates else math.nan
 
     return {
         "loop": math.nan,
@@ -142,29 +102,25 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
-    failed = False
-    print(
-        "| algorithm | shape | loop /s | eager /s | compiled /s | train() /s | x loop | x MADDPG | train()/compiled |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+    header = ["algorithm", "shape", "loop /s", "eager /s", "compiled /s", "train() /s", "x loop", "x MADDPG"]
+    header.append("train()/compiled")
+    print(f"{row(header)}\n|{'---|' * len(header)}")
+    missed = False
     for algorithm in arguments.algos:
         for shape, (*_, least, share) in SHAPES.items():
             r = measure(algorithm, shape, arguments.critic_state, arguments.rounds, arguments.seconds)
-            print(
-                f"| {algorithm} | {shape} | {shown(r['loop'], 0)} | {r['eager']:.0f} | {r['compiled']:.0f} "
-                f"| {r['end to end']:.0f} | {shown(r['compiled/loop'], 1)} | {r['compiled/maddpg']:.2f} "
-                f"| {r['end to end/compiled']:.2f} |",
-                flush=True,
-            )
+            cells = [algorithm, shape, shown(r["loop"], 0), shown(r["eager"], 0), shown(r["compiled"], 0)]
+            cells += [shown(r["end to end"], 0), shown(r["compiled/loop"], 1), shown(r["compiled/maddpg"], 2)]
+            print(row([*cells, shown(r["end to end/compiled"], 2)]), flush=True)
             below = []
             if algorithm == "maddpg" and (r["compiled/loop"] < least or r["end to end/compiled"] < share):
                 below.append(f"at least {least} x loop and {share} of the compiled update end to end")
             if r["compiled/maddpg"] < AGAINST_MADDPG.get(algorithm, 0.0):
                 below.append(f"at least {AGAINST_MADDPG[algorithm]} of MADDPG's updates")
-            failed = failed or bool(below)
+            missed = missed or bool(below)
             for bar in below:
                 print(f"below the bar: {bar}")
-    sys.exit(failed)
+    sys.exit(missed)
 
 
 if __name__ == "__main__":
