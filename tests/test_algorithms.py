@@ -240,7 +240,7 @@ class PictureAgents(TwoAgents):
         (lambda c: c.training(grad_clip_by="max"), r"grad_clip_by` \(max\) must be one of"),
         (
             lambda c: c.training(actor="gru"),
-            r"actor 'gru' is illegal.*; legal are 'mlp', 'lstm', a subclass of Actor, or where",
+            r"actor 'gru' is illegal.*; legal are 'mlp', 'lstm', .*, a subclass of Actor, or where",
         ),
         (lambda c: c.training(seq_length=0), r"seq_length=0 is illegal; legal: an integer >= 1"),
         (lambda c: c.training(seq_length=2.5), r"seq_length=2.5 is illegal; legal: an integer >= 1"),

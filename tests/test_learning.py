@@ -151,7 +151,7 @@ class CueGame(Game):
 
 @pytest.mark.parametrize(
     ("algorithm", "memory"),
-    [("maddpg-lstm", {}), ("maddpg", {}), ("maddpg-lstm", {"seq_length": 1, "carry_hidden": True})],
+    [("maddpg-lstm", {}), ("maddpg", {}), ("maddpg-lstm", {"seq_length": 1, "stored_state": True})],
 )
 def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str, memory: dict[str, Any]) -> None:
     """Without memory the last actions agree with the cue half of the time.

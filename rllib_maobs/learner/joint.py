@@ -293,9 +293,7 @@ class JointLearner(TorchLearner):
             try:
                 result = call()
             except Exception as error:
-                raise ValueError(
-                    f"{names} can't be called for all agents at once by torch.func.vmap: {error}"
-                ) from error
+                raise ValueError(f"{names} can't be called for all agents at once by vmap: {error}") from error
             if result.shape != (rows, agents, width):
                 raise ValueError(
                     f"{names} must return {width} numbers in a last dimension; for {agents} agents and a batch of "

@@ -377,9 +377,9 @@ def leading(state_layout: Layout, num_agents: int) -> list[Entities]:
         found += group.count
     if found != num_agents or len({group[2:] for group in groups}) > 1 or not groups[0].position:
         raise ValueError(
-            f"An entity critic needs a state whose first groups are the {num_agents} agents, with a position and of "
-            f'one size, not {[tuple(group) for group in state_layout][:4]}: critic_state="world" of an environment that '
-            f'says what its state is made of, or training(state_layout=[("agent", {num_agents}, 4, 2), ...]).'
+            f"An entity critic needs a state whose first groups are the {num_agents} agents, with a position and "
+            f'of one size, not {[tuple(group) for group in state_layout][:4]}: critic_state="world" of an environment '
+            f'that says what its state is made of, or training(state_layout=[("agent", {num_agents}, 4, 2), ...]).'
         )
     return groups
 
