@@ -32,7 +32,7 @@ def squash(offset: Tensor) -> Tensor:
 
 
 def heard(p: Named, name: str, senders: list[tuple[Tensor, Tensor]], receiver: Tensor) -> Tensor:
-    """Pool over senders (offset, features), a softmax in each channel; zeros without senders."""
+    """Pool over senders (offset, features), a softmax in each channel; nothing without senders; then the value."""
     width = len(p[f"{name}.value.bias"])
     values, logits = [], []
     for offset, features in senders:
@@ -42,7 +42,7 @@ def heard(p: Named, name: str, senders: list[tuple[Tensor, Tensor]], receiver: T
         if len(receiver):
             x = x + linear(p, f"{name}.from_receiver", receiver)
         x = x.clamp(min=0.0)
-        values.append(linear(p, f"{name}.value", x))
+        values.append(x)
         logits.append(linear(p, f"{name}.logit", x))
     out = []
     for channel in range(width):
@@ -51,7 +51,7 @@ def heard(p: Named, name: str, senders: list[tuple[Tensor, Tensor]], receiver: T
             continue
         weights = [torch.exp(logit[channel] - max(float(other[channel]) for other in logits)) for logit in logits]
         out.append(sum(w * v[channel] for w, v in zip(weights, values, strict=True)) / sum(weights))
-    return torch.stack(out)
+    return linear(p, f"{name}.value", torch.stack(out))
 
 
 def cut(layout: list, x: Tensor) -> dict[str, list[tuple[Tensor, Tensor]]]:

@@ -3,9 +3,9 @@
 To an MLP "target 0" and "target 1" are different numbers; to these networks they are two of a set. Nothing in them
 depends on how many entities there are: one set of weights serves a team of any size among any number of obstacles.
 
-An `Edge` tells receivers what there is around them: for every pair of a receiver and a sender
-relu(W_rel offset + W_recv receiver + W_send sender), then values and logits, and a softmax over the senders in each
-channel. Its terms are computed for each entity and added by broadcasting.
+An `Edge` tells receivers what there is around them: for every pair of a receiver and a sender h = relu(W_offset offset
++ W_receiver receiver + W_sender sender), whose terms are computed for each entity and added by broadcasting; the mean
+of h over the senders, weighted in each channel by a softmax of a linear map of h; then a linear map.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Edge(nn.Module):
         self.from_offset = nn.Linear(space + 1, width)
         self.from_sender = nn.Linear(sender, width, bias=False) if sender else None
         self.from_receiver = nn.Linear(receiver, width, bias=False) if receiver else None
-        self.value, self.logit = nn.Linear(width, width), nn.Linear(width, width)
+        self.logit, self.value = nn.Linear(width, width), nn.Linear(width, width)
 
     def forward(
         self,
@@ -74,10 +74,10 @@ class Edge(nn.Module):
                 hears all.
 
         Returns:
-            `(..., R, width)`; zeros if there are no senders.
+            `(..., R, width)`; the value of silence if there are no senders.
         """
         if offset.shape[-2] == 0:
-            return offset.new_zeros(*offset.shape[:-2], self.width)
+            return self.value(offset.new_zeros(*offset.shape[:-2], self.width))
         pairs = self.from_offset(squashed(offset))  # (..., R, S, W)
         if self.from_sender is not None and sender is not None:
             pairs = pairs + self.from_sender(sender).unsqueeze(-3)
@@ -90,7 +90,8 @@ class Edge(nn.Module):
         weights = torch.softmax(logits, dim=-2)
         if absent is not None:
             weights = weights * (1.0 - absent.unsqueeze(-1))  # where nobody is there, nothing is heard
-        return (weights * self.value(pairs)).sum(-2)
+        # The values after the pool, not before: one product for each receiver instead of each pair.
+        return self.value((weights * pairs).sum(-2))
 
 
 class Ego(nn.Module):
