@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.func import grad_and_value
 
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
-from rllib_maobs.learner.update import StackedAdam, clipped, compiled
+from rllib_maobs.learner.update import StackedAdam, clipped, compiled, denormals_are_zero
 from rllib_maobs.modules import Params, Stack
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
@@ -373,9 +373,10 @@ class JointLearner(TorchLearner):
         if self._draw is not None:
             noise = self._draw(whole.actions.shape, generator=self._generator)
             whole = whole._replace(noise=noise.to(whole.actions.device))
-        for minibatch in whole.unbind():
-            report = self.step(minibatch)
-            self._sum = report.clone() if self._sum is None else self._sum.add_(report)
+        with denormals_are_zero():
+            for minibatch in whole.unbind():
+                report = self.step(minibatch)
+                self._sum = report.clone() if self._sum is None else self._sum.add_(report)
         count, size = whole.rewards.shape[:2]
         self._updates += count
         self._weights_seq_no += 1
