@@ -7,6 +7,7 @@ an MLP needs only the total length. Nothing here is about PyTorch: arrays and te
 from __future__ import annotations
 
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any, NamedTuple, TypeVar
 
 ArrayT = TypeVar("ArrayT", bound=Any)
@@ -85,7 +86,7 @@ def as_layout(groups: Iterable[Iterable[Any]], size: int | None, owner: str) -> 
                 f'size, position), e.g. ("target", 3, 2).'
             ) from None
         numbers = entities[1:]
-        integers = all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
+        integers = all(isinstance(n, Integral) and not isinstance(n, bool) for n in numbers)
         if not isinstance(entities.name, str) or not integers or min(numbers) < 0 or entities.size < 1:
             raise ValueError(
                 f"The layout of the {owner} has a group {tuple(entities)!r}; legal are a name, a count >= 0, a size >= "
@@ -96,7 +97,7 @@ def as_layout(groups: Iterable[Iterable[Any]], size: int | None, owner: str) -> 
                 f"The layout of the {owner}: position ({entities.position}) of group {entities.name!r} must not be "
                 f"larger than its size ({entities.size})."
             )
-        layout.append(entities)
+        layout.append(Entities(entities.name, *map(int, numbers)))
     names = [group.name for group in layout]
     if len(set(names)) < len(names):
         raise ValueError(f"The layout of the {owner} names a group twice: {names}.")

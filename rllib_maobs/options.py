@@ -108,7 +108,7 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
     if hint is float:
         finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
         return finite, float(value) if finite else value
-    return not isinstance(hint, type) or isinstance(value, hint), value
+    return hint is Any or not isinstance(hint, type) or isinstance(value, hint), value
 
 
 def _describe(hint: Any) -> str:

@@ -34,15 +34,17 @@ class Registry(Generic[T], Mapping[str, type[T]]):
         return len(self._classes)
 
     def register(self, name: str, cls: type[T]) -> None:
-        """Makes a class known by a name in this process; it replaces one of the same name.
+        """Makes a class known by a name in this process; it replaces one of the same name, but none of this package's.
 
         Ray's worker processes do not see it: there, give the class itself, or its place as "package.module:Class".
 
         Raises:
-            ValueError: If it is no such class.
+            ValueError: If it is no such class, or the name is taken by one of this package.
         """
         if not (isinstance(cls, type) and issubclass(cls, self._base)):
             raise ValueError(f"Cannot register {cls!r} as {self._kind}; legal is a subclass of {self._base.__name__}.")
+        if name in self._classes and _ours(self._classes[name]) and cls is not self._classes[name]:
+            raise ValueError(f"{name!r} is this package's {self._classes[name].__name__}: choose another name.")
         self._classes[name] = cls
 
     def resolve(self, given: Any) -> type[T]:
@@ -72,13 +74,33 @@ class Registry(Generic[T], Mapping[str, type[T]]):
 
         A class of a script or a function can't be imported elsewhere: it is pickled whole.
         """
-        if isinstance(given, str):
-            return given
-        for name, cls in self._classes.items():
-            if cls is given and cls.__module__.split(".")[0] == __name__.split(".")[0]:
+        cls = self.resolve(given)
+        for name, known in self._classes.items():
+            if known is cls and _ours(cls):
                 return name
-        importable = given.__module__ != "__main__" and "<locals>" not in given.__qualname__
-        return f"{given.__module__}:{given.__qualname__}" if importable else given
+        place = f"{cls.__module__}:{cls.__qualname__}"
+        return place if cls.__module__ != "__main__" and _imported(place) is cls else cls
+
+
+def _ours(cls: type[Any]) -> bool:
+    return cls.__module__.split(".")[0] == __name__.split(".")[0]
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two settings are the same: one object, or equal in value; what can't be compared is not."""
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(value, other[name]) for name, value in one.items())
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    try:
+        equal = one == other
+        return bool(equal.all()) and one.shape == other.shape if hasattr(one, "shape") else equal is True
+    except Exception:
+        return False
 
 
 def _imported(place: str) -> Any:

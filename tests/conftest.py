@@ -70,7 +70,7 @@ def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Ba
             count = torch.randint(1, length + 1, (size, 1), generator=generator)
             mask = (torch.arange(length) >= length - count).to(torch.get_default_dtype())
         if config.stored_state:
-            recurrent_state = normal(size, n, 2, config.model_config["lstm_cell_size"])
+            recurrent_state = normal(size, n, 2, config.model_config.get("lstm_cell_size", 64))
         if config.critic_state == "world" and config.uses_state:
             state = normal(size, config.state_size)
         return Moment(obs, state, window, mask, recurrent_state, name)

@@ -80,9 +80,9 @@ def ego(p: Named, name: str, layout: list, x: Tensor, extra: Tensor | None) -> T
             if g not in (*AGENTS, *DEAF):
                 for mate in mates:
                     told = [(other - place, features) for other, features in groups[mate]]
-                    rest = torch.cat([rest, heard(p, f"{name}.heard.{g}_from_{mate}", told, _own(groups[g], place))])
+                    rest = torch.cat([rest, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, _own(groups[g], place))])
             senders.append((place, rest))
-        parts.append(heard(p, f"{name}.edges.{g}", senders, own))
+        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own))
     return torch.cat(parts)
 
 
@@ -124,7 +124,7 @@ def world(p: Named, name: str, layout: list, x: Tensor, action: Tensor, agent: i
                 if g not in DEAF:
                     for mate in names:
                         told = [(other - place, features) for other, features, _ in told_of[mate]]
-                        whole = torch.cat([whole, heard(p, f"{name}.heard.{g}_from_{mate}", told, rest)])
+                        whole = torch.cat([whole, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, rest)])
                 senders.append((place - me[0], whole))
-        parts.append(heard(p, f"{name}.edges.{g}", senders, own))
+        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own))
     return torch.cat(parts)

@@ -149,7 +149,7 @@ def test_a_users_own_environment_says_it_in_the_config(ray_session: None) -> Non
         config.build_algo()
     config.training(observation_layouts={f"agent_{i}": groups for i in range(3)})
     algo = config.build_algo()
-    assert [name for name, _ in algo.get_module("agent_0").actor.ego.edges.items()] == ["target", "agent"]
+    assert [name for name, _ in algo.get_module("agent_0").actor.ego.edges.items()] == ["of_target", "of_agent"]
     algo.train()
     algo.stop()
 

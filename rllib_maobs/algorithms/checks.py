@@ -6,11 +6,12 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import torch
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.policy.policy import PolicySpec
 
 from rllib_maobs.envs.team import Team, shares_reward
 from rllib_maobs.layout import Layout
-from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, RecurrentActor
+from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, EntityActor, EntityLSTMActor, RecurrentActor
 from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.options import check_value
@@ -19,7 +20,9 @@ from rllib_maobs.runner import JointEnvRunner, make_env
 if TYPE_CHECKING:
     from rllib_maobs.algorithms.config import JointConfig
 
-_STATES, _ACTIONS = ("observation", "state"), ("action", "joint_action")
+_CRITICS_SEE = (), ("observation", "action"), ("state", "action"), ("state", "joint_action")
+# What a policy's own RLModuleSpec may set.
+_OF_A_POLICY = (*COMMON_SETTINGS, "actor", "actor_settings", "critic", "critic_settings")
 
 
 def one_of(name: str, value: Any, legal: Collection[str]) -> None:
@@ -37,9 +40,11 @@ def check_settings_of(config: JointConfig) -> None:
     """Checks each setting by itself, those that exclude each other, and those of RLlib that joint training needs."""
     for name, hint in config.legal.items():
         setattr(config, name, check_value(getattr(config, name), hint, name, type(config).__name__))
-    if config.critic_sees:
-        one_of("critic_sees[0]", config.critic_sees[0], _STATES)
-        one_of("critic_sees[1]", config.critic_sees[1], _ACTIONS)
+    if config.critic_sees not in _CRITICS_SEE:
+        raise ValueError(f"critic_sees must be one of {', '.join(map(str, _CRITICS_SEE))}, not {config.critic_sees!r}.")
+    for name in ("exploration", "actor_settings", "critic_settings"):
+        if not isinstance(getattr(config, name), dict):
+            raise ValueError(f"{name} must be a dict of settings by name, not {getattr(config, name)!r}.")
     for name in ("train_batch_size_per_learner", "num_steps_sampled_before_learning_starts", "seq_length"):
         if getattr(config, name) > config.replay_buffer_capacity:
             raise ValueError(
@@ -70,16 +75,29 @@ def check_networks(config: JointConfig) -> None:
                 f"Unknown model_config setting {name!r}; legal are {', '.join(COMMON_SETTINGS)}. Settings of one "
                 f"network alone are training(actor_settings={{...}}) and training(critic_settings={{...}})."
             )
+    if isinstance(config._rl_module_spec, MultiRLModuleSpec):
+        for policy, spec in config._rl_module_spec.rl_module_specs.items():
+            for name in spec.model_config if isinstance(spec.model_config, dict) else ():
+                if name not in _OF_A_POLICY:
+                    raise ValueError(
+                        f"The RLModuleSpec of policy {policy!r} sets {name!r}; policies may differ in "
+                        f"{', '.join(_OF_A_POLICY)}, everything else is training()'s."
+                    )
     settings = config.model_config
-    one_of("model_config['activation']", settings["activation"], ACTIVATIONS)
-    hidden = settings["hidden_sizes"]
+    one_of("model_config['activation']", settings.get("activation", "relu"), ACTIVATIONS)
+    hidden = settings.get("hidden_sizes", (64,))
     if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
         raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
-    cell = settings["lstm_cell_size"]
+    cell = settings.get("lstm_cell_size", 64)
     if not isinstance(cell, int) or cell < 1:
         raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}.")
     actor = ACTORS.resolve(config.actor)
     network_settings(actor, settings, config.actor_settings, ACTOR_ARGUMENTS)
+    if config.normalize_observations and issubclass(actor, EntityActor | EntityLSTMActor):
+        raise ValueError(
+            f"normalize_observations must be False with {actor.__name__}: it shifts and scales each number on its "
+            f"own, so that alike entities would differ."
+        )
     recurrent = issubclass(actor, RecurrentActor)
     if recurrent and not config.supports.recurrent:
         raise ValueError(f"{config.name} is not defined with recurrent actors; {actor.__name__} is one.")
@@ -186,6 +204,8 @@ def check_team(config: JointConfig) -> None:
 
 def check_layouts(config: JointConfig) -> None:
     """Builds every policy's networks once, so that one which can't do with its layout is an error now."""
+    if config.mixes and config.mixer_settings() is None:
+        raise ValueError(f"{config.name} mixes values (mixes=True), but its mixer_settings() says not how.")
     team = config.team
     spaces = {mid: team.spaces(agent) for agent, mid in zip(team.agents, config.module_ids, strict=True)}
     specs = config.get_multi_rl_module_spec(spaces=spaces).rl_module_specs

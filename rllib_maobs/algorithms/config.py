@@ -352,9 +352,6 @@ class JointConfig(AlgorithmConfig):
     @override(AlgorithmConfig)
     def _model_config_auto_includes(self) -> dict[str, Any]:
         return {
-            "hidden_sizes": (64, 64, 64),
-            "activation": "relu",
-            "lstm_cell_size": 64,
             "actor": ACTORS.reference(self.actor),
             "actor_settings": self.actor_settings,
             "critic": CRITICS.reference(self.critic),

@@ -40,14 +40,19 @@ class QLearner(JointLearner):
 
     @override(JointLearner)
     def stacks(
-        self, modules: Sequence[Any], prefix: str, action_mask: Tensor | None, agent_ids: Tensor | None
+        self,
+        modules: Sequence[Any],
+        prefix: str,
+        action_mask: Tensor | None,
+        agent_ids: Tensor | None,
+        like: Parts | None = None,
     ) -> Parts:
         """The utilities, and the mixer if there is one."""
         networks = [getattr(m, f"{prefix}utility") for m in modules]
         names = [f"the utility of {agent}" for agent in self.config.team.agents]
         return Parts(
             config=self.config,
-            actors=Actors(networks, names),
+            actors=Actors(networks, names, like=None if like is None else like.actors),
             acting_role=CRITIC,  # utilities act, and are learned as critics are
             critics=None,
             mixers=self.mixers(prefix),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from torch.func import grad_and_value
 
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
 from rllib_maobs.learner.update import StackedAdam, clipped, compiled, denormals_are_zero
-from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules import Actor, Params, RecurrentActor, Stack
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
 from rllib_maobs.replay import Batch, Moment
@@ -134,11 +135,13 @@ class JointLearner(TorchLearner):
             # Each loss sees the other role's parameters as they are outside of the gradient: constants.
             tracked = TeamNetworks(self.parts, {**online, **params, ACTOR: online[ACTOR]})
             losses, q = self.critic_loss(tracked, TeamNetworks(self.target_parts, target), batch)
+            self._check_losses("critic_loss", losses, q)
             if not self._with_actors:
                 return losses.sum(), (losses, q)
-            constant = TeamNetworks(self.parts, {**online, ACTOR: params[ACTOR]}, constant=tracked)
-            outputs = constant.outputs(batch.now)
+            outputs = TeamNetworks(self.parts, params).outputs(batch.now)
+            constant = TeamNetworks(self.parts, online, constant=tracked)
             actor_losses = self.actor_loss(constant.actions(outputs, batch.noise), constant, batch)
+            self._check_losses("actor_loss", actor_losses)
             regularization = self.config.action_regularization * outputs.square().mean((0, 2)).sum()
             return losses.sum() + actor_losses.sum() + regularization, (losses, q, actor_losses)
 
@@ -150,11 +153,22 @@ class JointLearner(TorchLearner):
         report = [losses, q.mean(0), *actor_losses]
         if self.has_actors and not self._with_actors:
             report.append(torch.zeros_like(losses))
-        gradients = {
-            role: self._roles[role].flatten(clipped(gradient, self.config.grad_clip, self.config.grad_clip_by))
-            for role, gradient in by_role.items()
-        }
+        gradients = {}
+        for role, gradient in by_role.items():
+            stack = self._roles[role]
+            free = {k: torch.zeros_like(g) if k in stack.constants else g for k, g in gradient.items()}
+            gradients[role] = stack.flatten(clipped(free, self.config.grad_clip, self.config.grad_clip_by))
         return gradients, torch.stack([values.expand(len(self.config.team.agents)) for values in report])
+
+    def _check_losses(self, name: str, losses: Tensor, q: Tensor | None = None) -> None:
+        """Raises a ValueError if what an algorithm's loss returned is not of the shape that it must have."""
+        agents = len(self.config.team.agents)
+        if losses.shape not in ((agents,), (1,)) or (q is not None and q.shape[1:] not in ((agents,), (1,))):
+            of = "" if q is None else f", and what they are of (B, {agents}) or (B, 1), not {tuple(q.shape)}"
+            raise ValueError(
+                f"{type(self).__name__}.{name} must return losses of shape ({agents},) or (1,), not "
+                f"{tuple(losses.shape)}{of}."
+            )
 
     def gradients(self, batch: Batch, *, with_actors: bool | None = None) -> tuple[dict[str, list[Tensor]], Tensor]:
         """All roles' gradients of one minibatch, and the report; compiled if so configured.
@@ -238,9 +252,8 @@ class JointLearner(TorchLearner):
         ids = torch.eye(len(team.agents), device=device) if config.critics_are_told else None
         columns = torch.tensor(config.state_columns, device=device)
         self._state_columns = None if len(columns) == len(team.agents) * team.observation_size else columns
-        self.parts, self.target_parts = (
-            self.stacks(modules, prefix, None if mask.all() else mask, ids) for prefix in ("", "target_")
-        )
+        self.parts = self.stacks(modules, "", None if mask.all() else mask, ids)
+        self.target_parts = self.stacks(modules, "target_", None if mask.all() else mask, ids, like=self.parts)
         self._roles, self._targets = map(self._by_role, (self.parts, self.target_parts))
         self.normalizers = Normalizers([m.normalizer for m in modules]) if config.normalize_observations else None
 
@@ -270,38 +283,81 @@ class JointLearner(TorchLearner):
 
     @torch.no_grad()
     def _try_networks(self) -> None:
-        """Calls every network once, so that one that can't be stacked is an error by name before training starts.
+        """Compares what the stacks compute with every agent's own network, once, on random inputs.
 
         Raises:
-            ValueError: If a network fails, or its result has another shape than it must have.
+            ValueError: If a network fails, if its result has another shape than it must have, or if called for all
+                agents at once it computes something else than by itself; names it.
         """
-        team, like, rows = self.config.team, self.parts.actors.flat, 2
+        team, rows, generator = self.config.team, 3, torch.Generator().manual_seed(0)
         agents, length = len(team.agents), self.config.window_length
-        obs = like.new_zeros(rows, agents, team.observation_size)
-        window = obs.unsqueeze(2).repeat(1, 1, length, 1) if length else None
-        mask = like.new_ones(rows, length) if length else None
-        state = like.new_zeros(rows, self.config.state_size) if self.config.uses_state else None
-        moment, actions = Moment(obs, state, window, mask), like.new_zeros(rows, agents, team.action_size)
-        nets = TeamNetworks(self.parts, self._params_of(self._roles))
-        calls: list[tuple[Stack, Callable[[], Tensor], int]]
-        calls = [(self.parts.actors, lambda: nets.outputs(moment), team.action_size)]
-        if self.parts.critics is not None:
-            calls.append((self.parts.critics, lambda: nets.q(moment, actions), 1 + self.config.twin_critics))
-        for stack, call, width in calls:
-            kinds = ", ".join(dict.fromkeys(type(network).__name__ for network in stack.networks))
-            names = f"{stack.names[0]}{'' if len(stack.names) == 1 else ' and the others'} ({kinds})"
+
+        def drawn(*shape: int) -> Tensor:
+            return torch.randn(shape, generator=generator).to(self._device)
+
+        obs, actions = drawn(rows, agents, team.observation_size), drawn(rows, agents, team.action_size)
+        window = drawn(rows, agents, length, team.observation_size) if length else None
+        mask = torch.ones(rows, length, device=self._device) if length else None
+        state = drawn(rows, self.config.state_size) if self.config.uses_state else None
+        moment = Moment(obs if window is None else window[:, :, -1], state, window, mask)
+        for parts, stacks in ((self.parts, self._roles), (self.target_parts, self._targets)):
+            nets = TeamNetworks(parts, self._params_of(stacks))
+            self._compare(parts.actors, partial(nets.outputs, moment), team.action_size, moment, actions)
+            if parts.critics is not None:
+                width = 1 + self.config.twin_critics
+                self._compare(parts.critics, partial(nets.q, moment, actions), width, moment, actions)
+
+    def _compare(
+        self, stack: Actors | Critics, call: Callable[[], Tensor], width: int, moment: Moment, actions: Tensor
+    ) -> None:
+        """Compares a stack's result, `(B, N, width)`, with that of each agent's own network."""
+        rows, agents = actions.shape[:2]
+        for agent, (network, name) in enumerate(zip(stack.networks, stack.names, strict=True)):
+            what = f"{name} ({type(network).__name__})"
             try:
-                result = call()
+                alone = self._alone(network, agent, moment, actions)
+                together = call()
             except Exception as error:
-                raise ValueError(f"{names} can't be called for all agents at once by vmap: {error}") from error
-            if result.shape != (rows, agents, width):
+                raise ValueError(f"{what} can't be called for all agents at once by vmap: {error}") from error
+            if together.shape != (rows, agents, width):
                 raise ValueError(
-                    f"{names} must return {width} numbers in a last dimension; for {agents} agents and a batch of "
-                    f"{rows} that is {(rows, agents, width)}, not {tuple(result.shape)}."
+                    f"{what} must return {width} numbers in a last dimension; for {agents} agents and a batch of "
+                    f"{rows} that is {(rows, agents, width)}, not {tuple(together.shape)}."
+                )
+            if not torch.isfinite(alone).all():
+                raise ValueError(f"{what} returns numbers that are not finite for ordinary inputs.")
+            own = together[:, agent, : alone.shape[-1]]
+            if not torch.allclose(own, alone, rtol=1e-3, atol=1e-4):
+                raise ValueError(
+                    f"{what} called for all agents at once computes something else than by itself (by up to "
+                    f"{(own - alone).abs().max():.2g}): is there anything in it but parameters, layers and settings?"
                 )
 
+    def _alone(self, network: Any, agent: int, moment: Moment, actions: Tensor) -> Tensor:
+        """What one agent's network computes by itself."""
+        team, config = self.config.team, self.config
+        if isinstance(network, Actor):
+            size = team.observation_sizes[agent]
+            if not isinstance(network, RecurrentActor):
+                return network(moment.obs[:, agent, :size])
+            assert moment.window is not None
+            return RecurrentActor.unroll(network, moment.window[:, agent, :, :size], moment.mask)[0]
+        local = not config.central_critic
+        state = moment.obs[:, agent, : team.observation_sizes[agent]] if local else moment.state
+        action = actions[:, agent, : team.action_sizes[agent]] if local else actions[:, agent]
+        if "joint_action" in config.critic_sees:
+            action = actions.flatten(1)
+        ids = self.parts.agent_ids
+        result: Tensor = network(state, action) if ids is None else network(state, action, ids[agent])
+        return result
+
     def stacks(
-        self, modules: Sequence[Any], prefix: str, action_mask: Tensor | None, agent_ids: Tensor | None
+        self,
+        modules: Sequence[Any],
+        prefix: str,
+        action_mask: Tensor | None,
+        agent_ids: Tensor | None,
+        like: Parts | None = None,
     ) -> Parts:
         """Stacks every agent's networks.
 
@@ -310,6 +366,7 @@ class JointLearner(TorchLearner):
             prefix: "" for the online networks, "target_" for the target networks.
             action_mask: See `Parts`.
             agent_ids: See `Parts`.
+            like: For the target networks, the online ones.
         """
         config = self.config
         actors, critics = (
@@ -318,9 +375,9 @@ class JointLearner(TorchLearner):
         )
         return Parts(
             config=config,
-            actors=Actors(*actors),
+            actors=Actors(*actors, like=None if like is None else like.actors),
             acting_role=ACTOR,
-            critics=Critics(*critics, tie=config.ties_critics),
+            critics=Critics(*critics, tie=config.ties_critics, like=None if like is None else like.critics),
             mixers=self.mixers(prefix),
             action_mask=action_mask,
             agent_ids=agent_ids,
@@ -412,12 +469,21 @@ class JointLearner(TorchLearner):
         if self.normalizers is not None:
             self.normalizers.merge(torch.from_numpy(np.require(observations, np.float32, "W")).to(self._device))
 
+    def _shapes(self) -> dict[str, Any]:
+        """What lies where in each role's flat tensor: parameters, and whose they are."""
+        return {role: {"parameters": dict(s.shapes), "agents": list(s.places)} for role, s in self._roles.items()}
+
     @override(Learner)
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """RLlib's state, the number of updates made and the random numbers to come."""
         state: dict[str, Any] = super().get_state(*args, **kwargs)
         generator = self._generator.get_state().numpy()
-        state[_PROGRESS] = {"updates": self._updates_lifetime, "generator": generator, "layout": _LAYOUT}
+        state[_PROGRESS] = {
+            "updates": self._updates_lifetime,
+            "generator": generator,
+            "layout": _LAYOUT,
+            "shapes": self._shapes(),
+        }
         return state
 
     @override(Learner)
@@ -432,6 +498,12 @@ class JointLearner(TorchLearner):
                 f"This learner's state was saved by an earlier revision of rllib-maobs, whose optimisers' numbers lie "
                 f"in another order (layout {state[_PROGRESS].get('layout', 1)}, here {_LAYOUT}): go on with it there, "
                 f"or take its trained agents with RLModule.from_checkpoint."
+            )
+        saved = state.get(_PROGRESS, {}).get("shapes")
+        if saved is not None and saved != self._shapes():
+            raise ValueError(
+                f"This learner's state is that of other networks, or of agents that share them otherwise: {saved} was "
+                f"saved, here it would be {self._shapes()}."
             )
         super().set_state(state)
         self._adam.bind()  # the optimisers' tensors are new ones

@@ -57,11 +57,11 @@ class TeamNetworks:
     def __init__(self, parts: Parts, params: Mapping[str, Params], constant: TeamNetworks | None = None) -> None:
         self.parts, self.params = parts, params
         self.config = parts.config
-        # The critics' share of each moment's state, by the moment's name.
-        self._encoded: dict[str, Input] = {}
+        # What the critics saw of states, and their share of it.
+        self._encoded: list[tuple[Input, Input]] = []
         if constant is not None:
-            for name, encoded in constant._encoded.items():
-                self._encoded[name] = encoded._replace(tensor=encoded.tensor.detach())
+            for state, encoded in constant._encoded:
+                self._encoded.append((state, encoded._replace(tensor=encoded.tensor.detach())))
 
     def outputs(self, moment: Moment) -> Tensor:
         """Every acting network's raw outputs for what its agent sees, before tanh or softmax: `(B, N, A)`."""
@@ -131,7 +131,7 @@ class TeamNetworks:
             of_actions = Shared(actions.flatten(1))
         else:
             of_actions = PerAgent(one_current(actions, others).flatten(2))
-        return self._values(moment, seen, of_actions)
+        return self._values(seen, of_actions)
 
     def cross_q(self, moment: Moment, actions: Tensor, *, others: Tensor | None = None) -> Tensor:
         """Every local critic's value of every agent, Q_a(o_j, u_j); the arguments are those of `q`.
@@ -140,14 +140,16 @@ class TeamNetworks:
             `(B, N, N, C)`; critic a first, then agent j.
         """
         of_actions: Input = Shared(actions) if others is None else PerAgent(one_current(actions, others))
-        return self._values(moment, Shared(moment.obs), of_actions)
+        return self._values(Shared(moment.obs), of_actions)
 
-    def _values(self, moment: Moment, state: Input, action: Input) -> Tensor:
+    def _values(self, state: Input, action: Input) -> Tensor:
         critics, params = self.parts.critics, self.params[CRITIC]
         assert critics is not None
-        if moment.name not in self._encoded:
-            self._encoded[moment.name] = critics.encode(params, state)
-        return critics.values(params, self._encoded[moment.name], action, self.parts.agent_ids)
+        for seen, encoded in self._encoded:
+            if seen.tensor is state.tensor and type(seen) is type(state):
+                return critics.values(params, encoded, action, self.parts.agent_ids)
+        self._encoded.append((state, critics.encode(params, state)))
+        return critics.values(params, self._encoded[-1][1], action, self.parts.agent_ids)
 
     def mix(self, values: Tensor, moment: Moment) -> Tensor:
         """The team's Q_tot(s, Q_1..Q_N) of values `(B, N)`: `(B, 1)`."""

@@ -100,7 +100,7 @@ def clipped(gradient: Params, limit: float | None, by: str) -> Params:
         return gradient
     if by == "value":
         return {name: g.clamp(-limit, limit) for name, g in gradient.items()}
-    squares = {name: g.flatten(1).square().sum(1) for name, g in gradient.items()}  # one for each network
+    squares = {name: g.reshape(len(g), -1).square().sum(1) for name, g in gradient.items()}  # one for each network
     if by == "global_norm":
         totals: dict[str, Tensor] = {}
         for name, square in squares.items():

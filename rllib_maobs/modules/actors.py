@@ -36,9 +36,10 @@ class Actor(nn.Module, ABC):
 
     All agents' actors are stacked and called at once (see `Stack`), by `torch.func.vmap`. So `forward` is made of
     tensor operations on any leading dimensions: no branch on a tensor's values, no buffers (BatchNorm), no random
-    numbers, and no `nn.LSTMCell` and its like, for which vmap has no rule. Parameters may have any shape. A further
-    parameter of the constructor is a setting. Its type hint is checked, and one named `hidden_sizes`, `activation` or
-    `cell_size` is set by RLlib's `model_config`, too.
+    numbers, and no `nn.LSTMCell` and its like, for which vmap has no rule. Parameters may have any shape; constants are
+    parameters with `requires_grad=False`. The constructor's first parameters have these names; a further one is a
+    setting. Its type hint is checked, and one named `hidden_sizes`, `activation` or `cell_size` is set by RLlib's
+    `model_config`, too.
 
     Args:
         layout: What the agent's observation is made of.
@@ -133,7 +134,7 @@ class LSTMActor(RecurrentActor):
         num_outputs: A.
         hidden_sizes: Width of each hidden layer; the cell takes the place of the first.
         activation: Of the further layers, a key of `ACTIVATIONS`.
-        cell_size: H, size of h and c; None for that of the layer whose place the cell takes.
+        cell_size: H, size of h and c.
     """
 
     def __init__(
@@ -142,10 +143,10 @@ class LSTMActor(RecurrentActor):
         num_outputs: int,
         hidden_sizes: Sequence[int] = (64, 64, 64),
         activation: str = "relu",
-        cell_size: Annotated[int, Range(1)] | None = None,
+        cell_size: Annotated[int, Range(1)] = 64,
     ) -> None:
         super().__init__(layout, num_outputs)
-        self.cell_size = size = cell_size or hidden_sizes[0]
+        self.cell_size = size = cell_size
         self.from_observation = nn.Linear(layout_size(layout), 4 * size)
         self.from_hidden = nn.Linear(size, 4 * size, bias=False)
         for parameter in self.parameters():  # nn.LSTM's own way to start
@@ -179,6 +180,20 @@ class LSTMActor(RecurrentActor):
             h, c = next_h, next_c
         assert h is not None and c is not None
         return self.layers(h), torch.stack([h, c], dim=-2)
+
+
+def first_to_define(cls: type, *methods: str) -> int:
+    """How far up in a class's bases the first one is that defines one of the methods."""
+    return next(i for i, base in enumerate(cls.__mro__) if any(method in vars(base) for method in methods))
+
+
+def unrolled(
+    actor: RecurrentActor, window: Tensor, mask: Tensor | None = None, state: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """`actor.unroll`; step by step where a derived class overrides `forward` alone."""
+    if first_to_define(type(actor), "forward") < first_to_define(type(actor), "unroll"):
+        return RecurrentActor.unroll(actor, window, mask, state)
+    return actor.unroll(window, mask, state)
 
 
 def _tanh(x: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from ray.rllib.utils.annotations import override
 from torch import Tensor, nn
 
 from rllib_maobs.layout import Layout, as_layout, flat, layout_size
-from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor
+from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor, unrolled
 from rllib_maobs.modules.critics import CRITICS, Critic
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.modules.normalizer import Normalizer
@@ -72,8 +73,13 @@ def network_settings(
         ValueError: For one that it does not take; names the legal ones.
     """
     takes = settings_of(cls, reserved)
-    common = {own: model_config[name] for name, own in COMMON_SETTINGS.items() if name in model_config and own in takes}
-    settings = {**common, **own}
+    anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values())
+    common = {
+        own: model_config[name]
+        for name, own in COMMON_SETTINGS.items()
+        if name in model_config and (own in takes or (anything and own == name))
+    }
+    settings = copy.deepcopy({**common, **own})  # each network has its own
     check_settings(cls, settings, reserved)
     return settings
 
@@ -257,7 +263,7 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         steps = []
         for now in obs.unsqueeze(1).unbind(1) if obs.dim() == 2 else obs.unbind(1):
             window, mask = append(window, mask, now)
-            outputs, ended = network.unroll(self.normalizer(window), mask, recurrent_state)
+            outputs, ended = unrolled(network, self.normalizer(window), mask, recurrent_state)
             recurrent_state = ended if stored else None
             steps.append(outputs)
         following = {"window": window, "mask": mask}

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rllib_maobs.layout import Layout, layout_size
+from rllib_maobs.modules.actors import first_to_define
 from rllib_maobs.modules.layers import ACTIVATIONS, mlp
 from rllib_maobs.registry import Registry
 
@@ -79,6 +80,13 @@ class Critic(nn.Module, ABC):
             `(..., C)`.
         """
         return self.value(self.encode(state), action, agent)
+
+
+def splits(cls: type[Critic]) -> bool:
+    """Whether a critic's values are to be computed by `encode` and `value`: not if `forward` is what was overridden."""
+    base = cls.__mro__.index(Critic)
+    encode, value = first_to_define(cls, "encode"), first_to_define(cls, "value")
+    return encode < base and value < base and first_to_define(cls, "forward") >= min(encode, value)
 
 
 class MLPCritic(Critic):

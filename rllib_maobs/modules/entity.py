@@ -128,13 +128,15 @@ class Ego(nn.Module):
         rest = {group.name: group.size - group.position for group in around}
         self.heard = nn.ModuleDict(
             {
-                f"{name}_from_{mate.name}": Edge(space, rest[mate.name], rest[name], edge)
+                _key(name, mate.name): Edge(space, rest[mate.name], rest[name], edge)
                 for name in self.listeners
                 for mate in self.mates
             }
         )
         told = {name: len(self.mates) * edge if name in self.listeners else 0 for name in self.around}
-        self.edges = nn.ModuleDict({name: Edge(space, rest[name] + told[name], own, edge) for name in self.around})
+        self.edges = nn.ModuleDict(
+            {_key(name): Edge(space, rest[name] + told[name], own, edge) for name in self.around}
+        )
         self.size = own + edge * len(self.around)
 
     def forward(self, observation: Tensor, extra: Tensor | None = None) -> Tensor:
@@ -149,13 +151,13 @@ class Ego(nn.Module):
             sender = rest[name]
             if name in self.listeners:
                 told = [
-                    self.heard[f"{name}_from_{mate.name}"](
+                    self.heard[_key(name, mate.name)](
                         offsets[mate.name].unsqueeze(-3) - offsets[name].unsqueeze(-2), rest[mate.name], rest[name]
                     )
                     for mate in self.mates
                 ]
                 sender = torch.cat([sender, *told], dim=-1)
-            heard = self.edges[name](offsets[name].unsqueeze(-3), sender, own.unsqueeze(-2))
+            heard = self.edges[_key(name)](offsets[name].unsqueeze(-3), sender, own.unsqueeze(-2))
             messages.append(heard.squeeze(-2))
         return torch.cat(messages, dim=-1)
 
@@ -193,15 +195,13 @@ class World(nn.Module):
         rest = {g.name: sender if g.name in names else g.size - g.position for g in around}
         self.listeners = [name for name in self.around if name not in (*names, *deaf)]
         self.heard = nn.ModuleDict(
-            {
-                f"{name}_from_{mate}": Edge(space, rest[mate], rest[name], edge)
-                for name in self.listeners
-                for mate in names
-            }
+            {_key(name, mate): Edge(space, rest[mate], rest[name], edge) for name in self.listeners for mate in names}
         )
         told = {name: len(names) * edge if name in self.listeners else 0 for name in self.around}
         own = agent + self.action_size
-        self.edges = nn.ModuleDict({name: Edge(space, rest[name] + told[name], own, edge) for name in self.around})
+        self.edges = nn.ModuleDict(
+            {_key(name): Edge(space, rest[name] + told[name], own, edge) for name in self.around}
+        )
         self.size = own + edge * len(self.around)
 
     def forward(self, state: Tensor, action: Tensor, agent: Tensor) -> Tensor:
@@ -239,7 +239,7 @@ class World(nn.Module):
             sender, absent = rest[name], None
             if name in self.listeners:
                 told = [
-                    self.heard[f"{name}_from_{mate}"](
+                    self.heard[_key(name, mate)](
                         place[mate].unsqueeze(-3) - place[name].unsqueeze(-2), rest[mate], rest[name]
                     )
                     for mate in names
@@ -250,7 +250,7 @@ class World(nn.Module):
                 absent = agent[..., None, start : start + count]  # an agent does not hear itself
                 start += count
             offset = (place[name] - own_place.unsqueeze(-2)).unsqueeze(-3)
-            messages.append(self.edges[name](offset, sender, own.unsqueeze(-2), absent).squeeze(-2))
+            messages.append(self.edges[_key(name)](offset, sender, own.unsqueeze(-2), absent).squeeze(-2))
         return torch.cat(messages, dim=-1)
 
 
@@ -362,6 +362,11 @@ class EntityCritic(Critic):
         whose = () if agent is None else (agent,)
         values = [layers(view(state, action, *whose)) for view, layers in zip(self.views, self.layers, strict=True)]
         return values[0] if len(values) == 1 else torch.cat(values, dim=-1)
+
+
+def _key(*names: str) -> str:
+    """A name that a module may have, whatever groups are called."""
+    return "_from_".join(["of", *names]).replace(".", "-").replace("of_from_", "of_", 1)
 
 
 def leading(state_layout: Layout, num_agents: int) -> list[Entities]:

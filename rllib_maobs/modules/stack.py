@@ -11,6 +11,8 @@ from torch.func import functional_call, vmap
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._pytree import tree_map
 
+from rllib_maobs.registry import same
+
 Params = dict[str, Tensor]
 """Parameters of stacked networks: each `(M, *shape)`, for the M alike networks of a group, as "group.name"."""
 Function = str | Callable[..., Any]
@@ -43,12 +45,14 @@ class _Group:
 
     Attributes:
         networks: The M networks.
+        members: Who uses each of them.
         agents: Who uses the first of them, then the second, ...
         shapes: Of their stacked parameters, `(M, *shape)`, by name.
     """
 
-    def __init__(self, networks: list[nn.Module], agents: list[int], functions: Sequence[Function]) -> None:
-        self.networks, self.agents = networks, agents
+    def __init__(self, networks: list[nn.Module], members: list[list[int]], functions: Sequence[Function]) -> None:
+        self.networks, self.members = networks, members
+        self.agents = [agent for agents in members for agent in agents]
         # The first network only lends its code; functional_call puts the stacked parameters in its own's place.
         self._calls = {function: _Call(networks[0], function) for function in functions}
         self.shapes = {name: (len(networks), *p.shape) for name, p in networks[0].named_parameters()}
@@ -69,18 +73,18 @@ class _Group:
         def shared(p: Params, *args: Tensor) -> Any:
             """One network for all its users: its weights meet all their inputs in one product."""
             if any(dim is not None for dim in dims):
-                return vmap(one, in_dims=(None, *dims), out_dims=1)(p, *args)
+                return _over(one, (None, *dims))(p, *args)
             return _expanded(one(p, *args), users)
 
         if users == 1:
-            return vmap(one, in_dims=(0, *dims), out_dims=1)(params, *tensors)
+            return _over(one, (0, *dims))(params, *tensors)
         if networks == 1:
             return shared({name: value[0] for name, value in params.items()}, *tensors)
         tensors = [
             tensor if dim is None else tensor.unflatten(dim, (networks, users))
             for tensor, dim in zip(tensors, dims, strict=True)
         ]
-        output = vmap(shared, in_dims=(0, *dims), out_dims=1)(params, *tensors)
+        output = _over(shared, (0, *dims))(params, *tensors)
         return tree_map(lambda tensor: tensor.flatten(1, 2), output)
 
 
@@ -100,6 +104,7 @@ class Stack:
         functions: What the stack can call.
         names: What to call each network in messages, e.g. "the actor of agent_0".
         tie: Whether all agents are to share the parameters of the first network.
+        like: The stack of networks that these are copies of (target networks): grouped as those are.
 
     Raises:
         ValueError: If a network can't be stacked; says which and why.
@@ -111,26 +116,37 @@ class Stack:
         functions: Sequence[Function] = ("forward",),
         names: Sequence[str] | None = None,
         tie: bool = False,
+        like: Stack | None = None,
     ) -> None:
         self.networks = list(networks)
         self.names = list(names or (f"network {i}" for i in range(len(networks))))
         for net, name in zip(networks, self.names, strict=True):
-            _check(net, name, like=networks[0] if tie else None)
+            _check(net, name)
         owners = [networks[0]] * len(networks) if tie else self.networks
+        _check_apart(owners, self.names)
         users: dict[int, list[int]] = {}
         for agent, net in enumerate(owners):
             users.setdefault(id(net), []).append(agent)
-        alike: dict[Any, list[list[int]]] = {}
-        for agents in users.values():
-            alike.setdefault((_kind(owners[agents[0]]), len(agents)), []).append(agents)
-        self._groups = [
-            _Group([owners[agents[0]] for agents in parts], [agent for agents in parts for agent in agents], functions)
-            for parts in alike.values()
+        if like is not None:
+            members: list[list[list[int]]] = [group.members for group in like._groups]
+        else:
+            members = []
+            for agents in users.values():
+                for alike in members:
+                    if len(alike[0]) == len(agents) and _alike(owners[alike[0][0]], owners[agents[0]]):
+                        alike.append(agents)
+                        break
+                else:
+                    members.append([agents])
+        if tie and (other := next((net for net in networks if not _alike(net, networks[0])), None)) is not None:
+            raise ValueError(f"{self.names[self.networks.index(other)]} can't share {self.names[0]}: they differ.")
+        self._groups: list[_Group] = [
+            _Group([owners[agents[0]] for agents in alike], alike, functions) for alike in members
         ]
         order = [agent for group in self._groups for agent in group.agents]
         self._order = [order.index(agent) for agent in range(len(order))]
         # Where each agent's parameters are: the group, and which of its networks.
-        self._places = [
+        self.places = [
             (g, group.agents.index(agent) * len(group.networks) // len(group.agents))
             for agent in range(len(order))
             for g, group in enumerate(self._groups)
@@ -139,14 +155,21 @@ class Stack:
         self.shapes: dict[str, tuple[int, ...]] = {
             f"{g}.{name}": shape for g, group in enumerate(self._groups) for name, shape in group.shapes.items()
         }
-        like = next(networks[0].parameters())
+        first = next(networks[0].parameters())
         total = sum(torch.Size(shape).numel() for shape in self.shapes.values())
-        self.flat = nn.Parameter(torch.empty(total, dtype=like.dtype, device=like.device))
+        self.flat = nn.Parameter(torch.empty(total, dtype=first.dtype, device=first.device))
         self.params: Params = self.unflatten(self.flat.detach())
         for agent, net in enumerate(owners):
             own = self.own(self.params, agent)
             for name, parameter in net.named_parameters():
                 own[name].copy_(parameter.detach())
+        # Parameters with requires_grad=False: constants, which no update moves.
+        self.constants = {
+            f"{g}.{name}"
+            for g, group in enumerate((like or self)._groups)
+            for name, parameter in group.networks[0].named_parameters()
+            if not parameter.requires_grad
+        }
         self._recorded: dict[tuple[Any, ...], Callable[..., Any]] = {}
         self._bind()
 
@@ -160,7 +183,7 @@ class Stack:
 
     def own(self, params: Params, agent: int) -> Params:
         """One agent's part of stacked parameters (or gradients), by its network's names; views."""
-        g, row = self._places[agent]
+        g, row = self.places[agent]
         return {name: params[f"{g}.{name}"][row] for name in self._groups[g].shapes}
 
     def share(self, other: Stack) -> None:
@@ -169,7 +192,7 @@ class Stack:
         Raises:
             ValueError: If the other stack's networks have a different architecture or number.
         """
-        if self.shapes != other.shapes or self._places != other._places:
+        if self.shapes != other.shapes or self.places != other.places:
             raise ValueError(f"Stacks differ: {self.shapes} and {other.shapes}.")
         self.flat = other.flat
         self._bind()
@@ -218,7 +241,9 @@ class Stack:
             return tuple(self._gathered(list(parts)) for parts in zip(*outputs, strict=True))
         width = max(output.shape[-1] for output in outputs)
         padded = [
-            output if output.shape[-1] == width else nn.functional.pad(output, (0, width - output.shape[-1]))
+            nn.functional.pad(output, (0, width - output.shape[-1]))
+            if output.dim() > 2 and output.shape[-1] != width
+            else output
             for output in outputs
         ]
         return _take(torch.cat(padded, dim=1) if len(padded) > 1 else padded[0], self._order, 1)
@@ -243,31 +268,77 @@ class Stack:
         return self._recorded[key](self.params, *tensors)
 
 
-def _check(net: nn.Module, name: str, like: nn.Module | None) -> None:
+_MODULE = frozenset(vars(nn.Module()))  # what every module has
+
+
+def _own(net: nn.Module) -> dict[str, Any]:
+    """The plain attributes of a network and of all its parts, by name."""
+    return {
+        f"{part}.{name}" if part else name: value
+        for part, module in net.named_modules()
+        for name, value in vars(module).items()
+        if name not in _MODULE
+    }
+
+
+def _check(net: nn.Module, name: str) -> None:
     """Raises a ValueError if a network can't be stacked."""
+    what = f"{name} ({type(net).__name__}) can't be stacked"
     if buffers := [key for key, _ in net.named_buffers()]:
         raise ValueError(
-            f"{name} ({type(net).__name__}) can't be stacked: it has the buffers {buffers} (BatchNorm?). Use "
-            f"LayerNorm, or parameters with requires_grad=False."
+            f"{what}: it has the buffers {buffers} (BatchNorm?). Use LayerNorm, or parameters with requires_grad=False."
         )
+    for key, value in _own(net).items():
+        values = [*value.values()] if isinstance(value, dict) else value if isinstance(value, list | tuple) else [value]
+        if any(isinstance(part, Tensor | nn.Module) for part in values):
+            raise ValueError(
+                f"{what}: its attribute {key!r} hides tensors or modules. Use nn.ModuleList for layers, and for "
+                f"constants nn.Parameter(..., requires_grad=False)."
+            )
     parameters = list(net.named_parameters())
     if not parameters:
-        raise ValueError(f"{name} ({type(net).__name__}) can't be stacked: it has no parameters.")
+        raise ValueError(f"{what}: it has no parameters.")
     kinds = {(p.dtype, p.device) for _, p in parameters}
     if len(kinds) > 1:
         raise ValueError(
-            f"{name} ({type(net).__name__}) can't be stacked: its parameters must be of one type and on one device, "
-            f"not { {key: (p.dtype, str(p.device)) for key, p in parameters} }."
+            f"{what}: its parameters must be of one type and on one device, not "
+            f"{ {key: (p.dtype, str(p.device)) for key, p in parameters} }."
         )
-    if like is not None and _kind(net) != _kind(like):
-        raise ValueError(f"{name} ({net}) can't share the parameters of {like}: they differ.")
 
 
-def _kind(net: nn.Module) -> Any:
-    """What alike networks have in common: class, parameters, layers, and their own settings and layouts."""
-    shapes = tuple((name, tuple(p.shape)) for name, p in net.named_parameters())
-    settings = {name: value for name, value in vars(net).items() if not name.startswith("_") and name != "training"}
-    return type(net), shapes, repr(net), repr(settings)
+def _check_apart(owners: Sequence[nn.Module], names: Sequence[str]) -> None:
+    """Raises a ValueError if networks of different agents have a parameter in common, or different types of numbers."""
+    owner_of: dict[int, nn.Module] = {}
+    for net, name in zip(owners, names, strict=True):
+        for key, parameter in net.named_parameters():
+            if owner_of.setdefault(id(parameter), net) is not net:
+                raise ValueError(
+                    f"{name} ({type(net).__name__}) can't be stacked: its parameter {key!r} is another agent's, too."
+                )
+            if parameter.dtype != next(owners[0].parameters()).dtype:
+                raise ValueError(
+                    f"{name} has parameters of {parameter.dtype}, {names[0]} others: they can't be stacked."
+                )
+
+
+def _alike(net: nn.Module, other: nn.Module) -> bool:
+    """Whether networks differ in the numbers of their parameters alone."""
+    shapes = [[(name, tuple(p.shape), p.requires_grad) for name, p in each.named_parameters()] for each in (net, other)]
+    return (
+        type(net) is type(other)
+        and shapes[0] == shapes[1]
+        and repr(net) == repr(other)
+        and same(_own(net), _own(other))
+    )
+
+
+def _over(function: Callable[..., Any], dims: tuple[int | None, ...]) -> Callable[..., Any]:
+    """`vmap` with the agents at dimension 1, also of an output that depends on no agent."""
+
+    def call(*args: Any) -> Any:
+        return tree_map(lambda tensor: tensor.movedim(0, 1), vmap(function, in_dims=dims)(*args))
+
+    return call
 
 
 def _expanded(output: Any, users: int) -> Any:

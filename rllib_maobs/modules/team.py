@@ -8,9 +8,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from rllib_maobs.layout import layout_size
-from rllib_maobs.modules.actors import Actor, RecurrentActor
+from rllib_maobs.modules.actors import Actor, RecurrentActor, unrolled
 from rllib_maobs.modules.agent import Seen
-from rllib_maobs.modules.critics import Critic
+from rllib_maobs.modules.critics import Critic, splits
 from rllib_maobs.modules.stack import Input, Params, PerAgent, Shared, Stack
 
 
@@ -20,12 +20,13 @@ class Actors(Stack):
     Args:
         networks: Every agent's; one that is listed several times is shared.
         names: What to call each in messages.
+        like: The stack of the networks that these are copies of.
 
     Raises:
         ValueError: If some are recurrent and others are not, or one can't be stacked.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], names: Sequence[str]) -> None:
+    def __init__(self, networks: Sequence[nn.Module], names: Sequence[str], like: Stack | None = None) -> None:
         self.recurrent = isinstance(networks[0], RecurrentActor)
         for net, name in zip(networks, names, strict=True):
             if isinstance(net, RecurrentActor) != self.recurrent:
@@ -33,7 +34,7 @@ class Actors(Stack):
                     f"All agents' actors must be recurrent, or none: {names[0]} is a {type(networks[0]).__name__}, "
                     f"{name} a {type(net).__name__}."
                 )
-        super().__init__(networks, (_respond,), names)
+        super().__init__(networks, (_respond,), names, like=like)
         self._width = max(layout_size(net.layout) for net in networks if isinstance(net, Actor))
 
     def outputs(self, params: Params, seen: Seen) -> tuple[Tensor, Tensor | None]:
@@ -71,14 +72,18 @@ class Critics(Stack):
         networks: Every agent's; one that is listed several times is shared.
         names: What to call each in messages.
         tie: Whether all agents are to share the parameters of the first.
+        like: The stack of the networks that these are copies of.
     """
 
-    def __init__(self, networks: Sequence[nn.Module], names: Sequence[str], tie: bool = False) -> None:
-        super().__init__(networks, (_encode, _value), names, tie)
+    def __init__(
+        self, networks: Sequence[nn.Module], names: Sequence[str], tie: bool = False, like: Stack | None = None
+    ) -> None:
+        super().__init__(networks, (_encode, _value, _whole), names, tie, like)
         self._widths = tuple(
             max(layout_size(getattr(net, f"{part}_layout")) for net in networks) for part in ("state", "action")
         )
-        self.encodes = any(getattr(type(net), "encode") is not Critic.encode for net in networks)  # noqa: B009
+        # Encodings of several kinds of critics would differ in what they are.
+        self.encodes = len(self._groups) == 1 and isinstance(networks[0], Critic) and splits(type(networks[0]))
 
     def encode(self, params: Params, state: Input) -> Input:
         """What of the values depends on the state alone, `(B, N, ...)`; the state itself if critics do not split."""
@@ -99,14 +104,14 @@ class Critics(Stack):
         """
         _check_width("actions", action.tensor, self._widths[1])
         whose = [] if agents is None else [PerAgent(agents, 0)]
-        result: Tensor = self(params, encoded, action, *whose, function=_value)
+        result: Tensor = self(params, encoded, action, *whose, function=_value if self.encodes else _whole)
         return result
 
 
 def _respond(actor: Actor, obs: Tensor, *rest: Tensor) -> Any:
     """What an actor is called for; observations of smaller agents come padded."""
     obs = _without_padding(obs, layout_size(actor.layout))
-    return actor.unroll(obs, *rest) if isinstance(actor, RecurrentActor) else actor(obs)
+    return unrolled(actor, obs, *rest) if isinstance(actor, RecurrentActor) else actor(obs)
 
 
 def _encode(critic: Critic, state: Tensor) -> Tensor:
@@ -114,9 +119,13 @@ def _encode(critic: Critic, state: Tensor) -> Tensor:
 
 
 def _value(critic: Critic, encoded: Tensor, action: Tensor, *agent: Tensor) -> Tensor:
-    if type(critic).encode is Critic.encode:
-        encoded = _without_padding(encoded, layout_size(critic.state_layout))
     return critic.value(encoded, _without_padding(action, layout_size(critic.action_layout)), *agent)
+
+
+def _whole(critic: Critic, state: Tensor, action: Tensor, *agent: Tensor) -> Tensor:
+    state = _without_padding(state, layout_size(critic.state_layout))
+    value: Tensor = critic(state, _without_padding(action, layout_size(critic.action_layout)), *agent)
+    return value
 
 
 def _check_width(what: str, tensor: Tensor, width: int) -> None:

@@ -18,6 +18,7 @@ from rllib_maobs.modules.agent import append
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
+from rllib_maobs.registry import same
 
 
 class Acting:
@@ -52,13 +53,17 @@ class Acting:
         self._padding = None if team.action_mask.all() else torch.from_numpy(~team.action_mask)
         self._scale(team)
         # Policies with equal settings explore together: one call, and one stream of random numbers.
-        together: dict[str, list[int]] = {}
+        together: list[tuple[dict[str, Any], list[int]]] = []
         for agent, module in enumerate(modules):
             settings = module.model_config.get("exploration", {})
-            together.setdefault(repr(sorted(settings.items(), key=str)), []).append(agent)
+            for other, agents in together:
+                if same(settings, other):
+                    agents.append(agent)
+                    break
+            else:
+                together.append((settings, [agent]))
         self._explorations = [
-            (agents, make_exploration(modules[agents[0]].model_config.get("exploration", {}), discrete=team.discrete))
-            for agents in together.values()
+            (agents, make_exploration(settings, discrete=team.discrete)) for settings, agents in together
         ]
         # The last T observations (E, T, N, O), which of them count (E, T), and the recurrent states (E, N, *H) with
         # which the last windows ended, if the next ones start from them.
@@ -68,12 +73,11 @@ class Acting:
             shape = (num_envs, first.seq_length)
             self._window = torch.zeros(*shape, len(team.agents), team.observation_size), torch.zeros(shape)
         if first.stored_state:
-            states = [module.acting.initial_state() for module in modules]  # type: ignore[operator]
-            if len({state.shape for state in states}) > 1:
-                shapes = {agent: tuple(s.shape) for agent, s in zip(team.agents, states, strict=True)}
+            states = [actor.initial_state() for actor in self.actors.networks]  # type: ignore[operator]
+            shapes = {agent: tuple(state.shape) for agent, state in zip(team.agents, states, strict=True)}
+            if len(set(shapes.values())) > 1:
                 raise ValueError(f"Recurrent states that are stored must have one shape for all agents, not {shapes}.")
-            self._initial_state = torch.stack(states)
-            self._recurrent_state = self._initial_state.repeat(num_envs, *[1] * self._initial_state.dim())
+            self._recurrent_state = torch.zeros(num_envs, len(modules), *next(iter(shapes.values())))
 
     def _scale(self, team: Team) -> None:
         """Finds the lower bound, and half the range, of what an action in [-1, 1] stands for, `(N, A)` each."""
@@ -100,7 +104,9 @@ class Acting:
         for part in self._window or ():
             part[mask] = 0.0
         if self._recurrent_state is not None:
-            self._recurrent_state[mask] = self._initial_state
+            # Asked for anew: it may be made from parameters.
+            initial = [actor.initial_state().detach().cpu() for actor in self.actors.networks]  # type: ignore[operator]
+            self._recurrent_state[mask] = torch.stack(initial)
         for _, exploration in self._explorations:
             exploration.reset(mask)
 
@@ -151,7 +157,13 @@ class Acting:
             if self._team.discrete:
                 parts.append(exploration.discrete(own, t, self.generator, sample=self._draws))
             else:
-                parts.append(exploration(own, t, self.generator))
+                explored = exploration(own, t, self.generator)
+                if explored.shape != own.shape:
+                    raise ValueError(
+                        f"{type(exploration).__name__} must return actions of shape {tuple(own.shape)}, as given, "
+                        f"not {tuple(explored.shape)}."
+                    )
+                parts.append(explored.clamp(-1.0, 1.0))
         if len(parts) == 1:
             return parts[0]
         order = np.argsort([agent for agents, _ in self._explorations for agent in agents])
