@@ -40,7 +40,7 @@ from rllib_maobs.envs import (
     register_scenario,
 )
 from rllib_maobs.envs.joint import register_envs
-from rllib_maobs.layout import Entities, Layout
+from rllib_maobs.layout import Entities, Layout, layout_size, split
 from rllib_maobs.learner import JointLearner, TeamNetworks
 from rllib_maobs.modules import (
     ACTORS,
@@ -49,6 +49,9 @@ from rllib_maobs.modules import (
     Actor,
     AgentModule,
     Critic,
+    EntityActor,
+    EntityCritic,
+    EntityLSTMActor,
     EpsilonGaussian,
     Exploration,
     LSTMActor,
@@ -93,6 +96,9 @@ __all__ = [
     "Batch",
     "Critic",
     "Entities",
+    "EntityActor",
+    "EntityCritic",
+    "EntityLSTMActor",
     "EpisodeMetricsCallback",
     "EpsilonGaussian",
     "Exploration",
@@ -128,9 +134,11 @@ __all__ = [
     "UtilityModule",
     "VDNConfig",
     "VectorEnv",
+    "layout_size",
     "make_vec",
     "parallel_env",
     "register",
     "register_algorithm",
     "register_scenario",
+    "split",
 ]

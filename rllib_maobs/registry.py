@@ -56,14 +56,14 @@ class Registry(Generic[T], Mapping[str, type[T]]):
         Raises:
             ValueError: If it is neither; names what is legal.
         """
-        cls = given
-        if isinstance(given, str):
-            if given in self._classes:
-                return self._classes[given]
-            cls = _imported(given)
-        if isinstance(cls, type) and issubclass(cls, self._base):
-            return cls
+        if isinstance(given, str) and given in self._classes:
+            return self._classes[given]
+        found = _imported(given) if isinstance(given, str) else given
+        if isinstance(found, type) and issubclass(found, self._base):
+            return found
         hint = closest(given, list(self._classes)) if isinstance(given, str) else ""
+        if isinstance(found, Exception):
+            raise ValueError(f"{self._kind} {given!r} can't be imported: {found}.") from found
         raise ValueError(
             f"{self._kind} {given!r} is illegal{hint}; legal are {', '.join(map(repr, self._classes))}, a subclass of "
             f'{self._base.__name__}, or where to import one from, as "package.module:Class".'
@@ -104,7 +104,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def _imported(place: str) -> Any:
-    """What lies at "package.module:Class"; None if there is nothing."""
+    """What lies at "package.module:Class", or the error of importing it; None if that is no such place."""
     module, colon, name = place.partition(":")
     if not colon:
         return None
@@ -112,8 +112,8 @@ def _imported(place: str) -> Any:
         found = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError):
-        return None
+    except Exception as error:  # whatever a module does when it is imported
+        return error
     return found
 
 

@@ -357,7 +357,7 @@ def test_compiled_code_keeps_the_python_values_that_a_loss_read(ray_session: Non
             {"actor": QuadraticCritic},
             "actor <class .*QuadraticCritic.* is illegal; legal are 'mlp', 'lstm', .*a subclass of",
         ),
-        ({"actor": "tests.nowhere:Actor"}, "actor 'tests.nowhere:Actor' is illegal"),
+        ({"actor": "tests.nowhere:A"}, "actor 'tests.nowhere:A' can't be imported: No module named 'tests.nowhere'"),
         ({"critic": "mpl"}, r"critic 'mpl' is illegal \(did you mean 'mlp'\?\)"),
         ({"exploration": {"type": Sparks, "every": 0}}, "Sparks: every=0 is illegal; legal: an integer >= 1"),
         (

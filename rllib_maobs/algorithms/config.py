@@ -16,7 +16,7 @@ from rllib_maobs.algorithms import checks
 from rllib_maobs.envs.team import Team
 from rllib_maobs.layout import Entities, Layout, layout_size
 from rllib_maobs.learner import MIXER, JointLearner
-from rllib_maobs.modules import ACTORS, CRITICS, Actor, AgentModule, Critic, MixerModule, RecurrentActor
+from rllib_maobs.modules import ACTORS, CRITICS, EXPLORATIONS, Actor, AgentModule, Critic, MixerModule, RecurrentActor
 from rllib_maobs.options import Range
 from rllib_maobs.runner import JointEnvRunner
 
@@ -203,12 +203,14 @@ class JointConfig(AlgorithmConfig):
             exploration: Settings of `EpsilonGaussian`: `epsilon` 0.1, `noise` 0.1, `decay` 5e-7 per env step,
                 `final` 0.05 (the paper's; algorithms of the Q-learning family have others). Or another kind with its
                 settings: `{"type": "ornstein-uhlenbeck", "theta": 0.15}`, `{"type": MyNoise}` (see `Exploration`).
-                Policies may differ: `config.rl_module(algorithm_config_overrides_per_module={"agent_0":
+                Policies may differ (what one is given replaces what all have):
+                `config.rl_module(algorithm_config_overrides_per_module={"agent_0":
                 maobs.JointConfig.overrides(exploration={"noise": 0.3})})`.
-            actor: "mlp" (default), "lstm" over the last `seq_length` observations (eq. 10), a subclass of `Actor`, or
+            actor: "mlp" (default), "lstm" over the last `seq_length` observations (eq. 10), "entity" or "entity-lstm"
+                over sets of entities (`EntityActor`; needs layouts), a subclass of `Actor`, or
                 where to import one from.
             actor_settings: What the actor's constructor takes besides.
-            critic: "mlp" (default), a subclass of `Critic`, or where to import one from.
+            critic: "mlp" (default), "entity" (`EntityCritic`), a subclass of `Critic`, or where to import one from.
             critic_settings: What the critic's constructor takes besides.
             observation_layouts: What each agent's observation is made of, by agent: `{"agent_0": [("self", 1, 4),
                 ("target", 3, 2, 2)], ...}` (see `Entities`). None (default) takes what the environment says, or one
@@ -365,7 +367,9 @@ class JointConfig(AlgorithmConfig):
     def exploration_of(self, module_id: str) -> dict[str, Any]:
         """One policy's settings of exploration."""
         own = self.get_config_for_module(module_id).exploration
-        return own if "type" in own else {**self.default_exploration, **own}
+        if "type" not in own:
+            return {**self.default_exploration, **own}
+        return {**own, "type": EXPLORATIONS.reference(own["type"])}
 
     @override(AlgorithmConfig)
     def get_default_rl_module_spec(self) -> RLModuleSpec:

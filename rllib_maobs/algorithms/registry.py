@@ -19,7 +19,7 @@ ALGORITHMS: Mapping[str, type[JointConfig]] = MappingProxyType(_CONFIGS)
 def register_algorithm(config: type[JointConfig], algorithm: type[JointAlgorithm] | None = None) -> type[JointConfig]:
     """Makes an algorithm known by its name: to Ray Tune, to `ALGORITHMS` and to whatever follows them.
 
-    May be used as a decorator. Ray's worker processes do not see it; there, Tune needs the module to be imported.
+    May be used as a decorator. Ray forgets names when it is shut down: `maobs.register()` tells them again.
 
     Args:
         config: Its configuration, whose `name` it gets; it replaces an algorithm of the same name.
@@ -40,6 +40,7 @@ def register_algorithm(config: type[JointConfig], algorithm: type[JointAlgorithm
         algorithm = type(config.__name__.removesuffix("Config"), (JointAlgorithm,), members)
     _CONFIGS[config.name] = config
     _CLASSES[config] = algorithm
+    register_trainable(algorithm.__name__, algorithm)
     return config
 
 

@@ -211,6 +211,11 @@ class StackedEnv:
         rows = np.zeros((len(self.agents), self._size), dtype=np.float32)
         for row, agent in zip(rows, self.agents, strict=True):
             own = np.asarray(obs[agent], dtype=np.float32).reshape(-1)
+            if own.size != flatdim(self.observation_spaces[agent]):
+                raise ValueError(
+                    f"The observation of agent {agent!r} has {own.size} numbers in environment copy {copy} at step "
+                    f"{self._steps[copy]}; its space is {self.observation_spaces[agent]}."
+                )
             row[: own.size] = own
         return rows
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -50,6 +50,9 @@ class JointLearner(TorchLearner):
 
     Attributes:
         has_actors: Whether there are actors, and an `actor_loss`.
+        noise: Random numbers that the losses need, "normal" or "uniform" in [0, 1), as `batch.noise` `(B, N, A)`.
+            Others would not be in a checkpoint. (Discrete actors have uniform ones, smoothed targets normal ones,
+            anyway.)
         parts: The stacked networks, and the team's constants.
         target_parts: The target networks.
         normalizers: The agents' running normalisation of observations, or None.
@@ -57,6 +60,7 @@ class JointLearner(TorchLearner):
     """
 
     has_actors = True
+    noise: ClassVar[Literal["normal", "uniform"] | None] = None
 
     @override(TorchLearner)
     def __init__(self, **kwargs: Any) -> None:
@@ -275,9 +279,11 @@ class JointLearner(TorchLearner):
                 )
                 optimizer_of |= dict.fromkeys(own, optimizer)
         self._adam = StackedAdam(self._roles, optimizer_of)
-        self._draw: Callable[..., Tensor] | None = None
-        if self.has_actors:
-            self._draw = torch.rand if team.discrete else torch.randn if config.target_noise else None
+        kind = self.noise
+        if self.has_actors and (team.discrete or config.target_noise):
+            kind = "uniform" if team.discrete else "normal"
+        draws: dict[str | None, Callable[..., Tensor]] = {"normal": torch.randn, "uniform": torch.rand}
+        self._draw = draws.get(kind)
         self._generator = torch.Generator().manual_seed(config.seed or 0)
         self._try_networks()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from rllib_maobs.layout import Layout, as_layout, flat, layout_size
 from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor, unrolled
 from rllib_maobs.modules.critics import CRITICS, Critic
-from rllib_maobs.modules.exploration import make_exploration
+from rllib_maobs.modules.exploration import Exploration, make_exploration
 from rllib_maobs.modules.normalizer import Normalizer
 from rllib_maobs.registry import check_settings, settings_of
 
@@ -143,11 +144,15 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         normalize = settings.get("normalize_observations", False)
         self.normalizer: nn.Module = Normalizer(size) if normalize else nn.Identity()
         self.discrete = isinstance(self.action_space, gym.spaces.Discrete)
-        self.exploration = make_exploration(settings.get("exploration", {}), discrete=self.discrete)
         cls = ACTORS.resolve(settings.get("actor", "mlp"))
         own = network_settings(cls, settings, settings.get("actor_settings", {}), ACTOR_ARGUMENTS)
         actor = cls(layout, int(self.action_space.n) if self.discrete else self.action_space.shape[0], **own)
         self.recurrent = isinstance(actor, RecurrentActor)
+        if isinstance(actor, RecurrentActor) and not isinstance(actor.initial_state(), Tensor):
+            raise ValueError(
+                f"{cls.__name__}.initial_state() must return one tensor, the state of one agent before its first "
+                f"observation, not {actor.initial_state()!r}."
+            )
         # T, the length of the windows that the actor sees; 0 without windows.
         self.seq_length: int = settings.get("seq_length", 1) if self.recurrent else 0
         self.stored_state: bool = self.recurrent and settings.get("stored_state", False)
@@ -226,6 +231,11 @@ class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         if list(self.normalizer.parameters()):
             raise ValueError("An agent with normalize_observations=True has statistics for one observation only.")
         return other
+
+    @cached_property
+    def exploration(self) -> Exploration:
+        """How it explores; made when it is first needed, so that an agent elsewhere acts without its noise's class."""
+        return make_exploration(self.model_config.get("exploration", {}), discrete=self.discrete)
 
     def greedy(self, outputs: Tensor) -> Tensor:
         """The policy's own actions: tanh of raw outputs `(..., A)`, or if discrete the best one's number `(...)`."""
