@@ -6,7 +6,9 @@
 
 Without `--record` the episodes run in a window, in real time. At the end the mean metrics are printed. CHECKPOINT is
 the folder of an RLlib algorithm checkpoint, of this package or of a stock algorithm trained on `MAObsEnv`; its
-policies act without exploration.
+policies act without exploration. Agents with entity networks that share a policy play teams of any size:
+
+    python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a action_mode=force
 """
 
 import argparse
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rllib_maobs.envs import SCENARIOS, MAObsParallelEnv, Recorder, parallel_env
+from rllib_maobs.layout import Layout
 
 Policy = Callable[[Mapping[str, NDArray[np.float32]]], dict[str, Any]]
 _MODULES = ("learner_group", "learner", "rl_module")
@@ -136,12 +139,15 @@ def make_policy(env: MAObsParallelEnv, name: str, seed: int = 0) -> Policy:
 class CheckpointPolicy:
     """Acts like the modules of an RLlib checkpoint, without exploration.
 
+    Modules with entity networks act in teams of another size than they were trained in, too.
+
     Args:
         env: The environment.
         checkpoint: Folder of an algorithm checkpoint. Its policy mapping says which module acts for which agent.
 
     Raises:
-        ValueError: If it holds none for an agent, or observations have another size than those of the environment.
+        ValueError: If it holds none for an agent, or observations or actions have another size than those of the
+            environment.
     """
 
     def __init__(self, env: MAObsParallelEnv, checkpoint: Path) -> None:
@@ -165,10 +171,15 @@ class CheckpointPolicy:
         numbers = np.eye(len(env.possible_agents), size, dtype=np.float32)
         self._ids = dict(zip(env.possible_agents, numbers, strict=True))
         for agent, module_id in self._module_of.items():
-            (here,) = env.observation_space(agent).shape
-            trained = self._modules[module_id].observation_space.shape[0] - len(self._ids[agent])
-            if trained != here:
-                raise ValueError(f"{agent} observes ({here},) in {env.scenario}, but was trained on ({trained},)")
+            _check_actions(env, agent, self._modules[module_id].action_space, config)
+        # What acts for each agent; agents of one module that see the same share what is made for a team of this size.
+        self._acting: dict[str, Any] = {}
+        made: dict[tuple[str, Layout], Any] = {}
+        for agent, module_id in self._module_of.items():
+            key = module_id, env.observation_layouts[agent]
+            if key not in made:
+                made[key] = _fitting(env, agent, self._modules[module_id], len(self._ids[agent]))
+            self._acting[agent] = made[key]
         self._spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
         self._states: dict[str, Any] = {}
 
@@ -185,7 +196,7 @@ class CheckpointPolicy:
         from ray.rllib.core.columns import Columns
         from ray.rllib.utils.spaces.space_utils import unsquash_action
 
-        module, space = self._modules[self._module_of[agent]], self._spaces[agent]
+        module, space = self._acting[agent], self._spaces[agent]
         seen = np.concatenate([self._ids[agent], observation])
         batch: dict[str, Any] = {Columns.OBS: torch.from_numpy(seen)[None]}
         if module.is_stateful():
@@ -209,6 +220,56 @@ class CheckpointPolicy:
 def _saved_config(checkpoint: Path) -> Any:
     """Return the settings of a checkpoint's algorithm, by name."""
     return pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())["ctor_args_and_kwargs"][0][0]
+
+
+def _check_actions(env: MAObsParallelEnv, agent: str, trained: Any, config: Any) -> None:
+    """Raise a ValueError if an agent was trained with other actions than those of the environment."""
+    here = env.action_space(agent)
+    if (here.shape, getattr(here, "n", None)) == (trained.shape, getattr(trained, "n", None)):
+        return
+    mode = (config.get("env_config") or {}).get("action_mode", "mpe")
+    raise ValueError(
+        f"{agent} has actions {_size(here)} in {env.scenario}, but was trained with {_size(trained)}: give the "
+        f"environment the options of the training, such as action_mode={mode}"
+    )
+
+
+def _size(space: Any) -> str:
+    return f"({space.shape[0]},)" if space.shape else f"0 to {space.n - 1}"
+
+
+def _fitting(env: MAObsParallelEnv, agent: str, module: Any, id_size: int) -> Any:
+    """Return a module that acts on what an agent observes: the trained one, or the same for a team of another size.
+
+    Args:
+        env: The environment.
+        agent: Whose.
+        module: As it was trained.
+        id_size: Length of the agent's number before its observation.
+
+    Raises:
+        ValueError: If the sizes differ, and the module's networks cannot act on another.
+    """
+    (here,) = env.observation_space(agent).shape
+    trained = module.observation_space.shape[0] - id_size
+    layout = env.observation_layouts[agent]
+    known = getattr(module, "model_config", None)
+    known = known.get("observation_layout") if isinstance(known, dict) else None
+    # A layout may differ at the same size, too: to entity networks, that is another team.
+    if trained == here and (known is None or id_size or [tuple(group) for group in known] == [*map(tuple, layout)]):
+        return module
+    try:
+        if id_size or not hasattr(module, "for_layout"):
+            raise ValueError("its networks have one size")
+        return module.for_layout(layout)
+    except ValueError as error:
+        if trained == here:
+            return module
+        raise ValueError(
+            f"{agent} observes ({here},) in {env.scenario}, but was trained on ({trained},). Networks that act in "
+            f'teams of any size are those of training(actor="entity"), without agent_id_input and '
+            f"normalize_observations"
+        ) from error
 
 
 def _film(env: MAObsParallelEnv, recorder: Recorder | None) -> None:

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,21 +21,30 @@ import numpy as np
 import pandas as pd
 import pytest
 import ray
+from PIL import Image
 from ray.rllib.algorithms import Algorithm
 
 import rllib_maobs as maobs
 from rllib_maobs.envs import make_vec
-from rllib_maobs.experiment import Experiment, load_curves, plot_curves, summarise
+from rllib_maobs.experiment import Experiment, decayed, load_curves, plot_curves, summarise
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
+from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
-from rllib_maobs.experiment.report import STEPS, to_markdown
+from rllib_maobs.experiment.report import STEPS, best_trial, to_markdown
 from rllib_maobs.experiment.resume import TESTED_RAY, forget_decisions
+from rllib_maobs.experiment.trial import Trial
 
 SCRIPTS = Path(__file__).parent.parent / "tuned_examples"
 EXPERIMENT = Experiment(
     name="demo", env="maobs/spread-3a", algorithms=("iddpg", "maddpg"), training={}, stop_timesteps=1000
 )
+
+
+def parsed(experiment: Experiment, *arguments: str) -> Any:
+    """The command line's arguments, in a results folder that is not there."""
+    parser = make_parser(experiment.name, experiment.algorithms, experiment.stop_timesteps)
+    return parse(parser, experiment.name, ["--results-dir", "new", *arguments], experiment.quick_algorithms)
 
 
 def result(algorithm: str, seed: int, steps: int, score: float, coverage: float = 0.5, **more: Any) -> dict[str, Any]:
@@ -122,6 +133,17 @@ def test_summarise() -> None:
     assert np.isnan(table.loc["maddpg", "score_std"])
 
 
+def test_the_best_trial_is_the_best_seed_of_the_best_algorithm() -> None:
+    curves = made_up_curves()
+    assert best_trial(curves) == "maddpg-seed0"
+    curves.loc[curves["trial"] == "iddpg-seed1", "score"] = 100.0
+    assert best_trial(curves) == "iddpg-seed1"
+    curves.loc[curves["trial"] == "iddpg-seed0", "score"] = -100.0  # one bad seed: the other algorithm is better
+    assert best_trial(curves) == "maddpg-seed0"
+    assert best_trial(curves.drop(columns="score")) is None
+    assert best_trial(curves.head(0)) is None
+
+
 @pytest.mark.parametrize("options", [{}, {"action_mode": "discrete"}, {"terminate_on_success": True}])
 def test_baselines_are_means_over_whole_episodes(options: dict[str, Any]) -> None:
     baselines = play_baselines("maobs/spread-3a", {"horizon": 100, **options}, episodes=20)
@@ -172,17 +194,44 @@ def test_plot_curves_draws_mean_and_spread(tmp_path: Path) -> None:
     assert not np.array_equal(both, matplotlib.image.imread(tmp_path / "wider.png"))
 
 
+def test_plot_curves_draws_what_is_not_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line each, in both panels; random play is a hundredth as good, and leaves half of the picture to the rest."""
+    figures: list[Any] = []
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, *args, **kwargs: figures.append(self))
+    curves = made_up_curves()
+    baselines = {
+        "random": {"return_agent_0": -4000.0, "coverage": 0.05},
+        "heuristic": {"return_agent_0": -10.0, "coverage": 0.9},
+        "lazy": {"return_agent_0": -700.0},
+    }
+    for scores in (curves["score"] - 500.0, curves["score"]):
+        plot_curves(curves.assign(score=scores), tmp_path / "curves.png", baselines=baselines)
+    negative, positive = figures
+    levels = [[set(line.get_ydata()) for line in axes.lines[2:]] for axes in negative.axes]
+    assert levels == [[{-4000.0}, {-10.0}, {-700.0}], [{0.05}, {0.9}]]
+    names = [text.get_text() for text in negative.legends[0].texts]
+    assert names == ["iddpg", "maddpg", "random", "heuristic", "lazy"]
+    score, coverage = negative.axes
+    low, middle, high = (score.transData.transform((0, y))[1] for y in (-4000, -500, -10))
+    assert 0.3 < (middle - low) / (high - low) < 0.7
+    ticks = score.get_yticks()
+    assert min(ticks) < -1000 < -100 < max(ticks) < 0
+    assert coverage.get_yscale() == positive.axes[0].get_yscale() == "linear"
+
+
 def colours(picture: Path) -> int:
     return len(np.unique(matplotlib.image.imread(picture).reshape(-1, 4), axis=0))
 
 
 @pytest.mark.parametrize(
-    ("reached", "error", "code", "says"),
+    ("reached", "own", "error", "code", "says"),
     [
-        ((1000, 1000), (None, None), None, "maddpg "),
-        ((1000, 400), (None, "boom"), 1, "FAILED: maddpg-seed0, see {}/maddpg-seed0/error.txt"),
-        ((1000, 400), (None, None), 130, "Interrupted. Go on with: python "),
-        ((1000, 400), (None, None), 130, "--resume --results-dir {}"),
+        ((1000, 1000), None, (None, None), None, "maddpg "),
+        ((1000, 1000), None, (None, None), None, "No film: iddpg-seed0, the best one, has no checkpoint."),
+        ((1000, 400), 400, (None, None), None, "maddpg "),
+        ((1000, 400), None, (None, "boom"), 1, "FAILED: maddpg-seed0, see {}/maddpg-seed0/error.txt"),
+        ((1000, 400), None, (None, None), 130, "Interrupted. Go on with: python "),
+        ((1000, 400), None, (None, None), 130, "--resume --results-dir {}"),
     ],
 )
 def test_the_end_of_a_run(
@@ -190,6 +239,7 @@ def test_the_end_of_a_run(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     reached: tuple[int, int],
+    own: int | None,
     error: tuple[str | None, str | None],
     code: int | None,
     says: str,
@@ -199,9 +249,11 @@ def test_the_end_of_a_run(
         write_results(tmp_path, [result(algorithm, 0, steps, -5.0)])
         path = str(tmp_path / f"{algorithm}-seed0")
         trials.append(SimpleNamespace(path=path, error=wrong, metrics={STEPS: float(steps)}))
-    args = parse(make_parser("demo", EXPERIMENT.algorithms, 1000), "demo", ["--results-dir", str(tmp_path / "new")])
+    variants = {"maddpg": {"algorithm": "maddpg", "stop_timesteps": own}} if own else {}
+    experiment = replace(EXPERIMENT, variants=variants)
+    args = parsed(experiment, "--seeds", "0")
     args.results_dir = tmp_path
-    assert (EXPERIMENT._report(args, trials, planned=2) or None) == code  # type: ignore[arg-type]
+    assert (experiment._report(args, trials, experiment.specs(args)) or None) == code  # type: ignore[arg-type]
     output = capsys.readouterr().out
     assert says.format(tmp_path) in output and "| heuristic " in output
     # A trial that failed is drawn, but not compared.
@@ -224,19 +276,39 @@ class FakeTrial(SimpleNamespace):
         return self.trial_id
 
 
+def fake(algorithm: str, seed: int, stop: int, **more: Any) -> FakeTrial:
+    config = {"algorithm": algorithm, "stop_timesteps": stop}
+    return FakeTrial(trial_id=f"{algorithm}-seed{seed}", config=config, **more)
+
+
 def test_progress_table() -> None:
-    table = ProgressTable(stop_timesteps=1000, every_s=30.0)
-    running = FakeTrial(trial_id="maddpg-seed0", status="RUNNING", last_result=result("maddpg", 0, 100, -5.0))
-    waiting = FakeTrial(trial_id="iddpg-seed0", status="PENDING", last_result={})
+    table = ProgressTable(every_s=30.0)
+    running = fake("maddpg", 0, 1000, status="RUNNING", last_result=result("maddpg", 0, 100, -5.0))
+    waiting = fake("iddpg", 0, 500, status="PENDING", last_result={})
     trials = [running, waiting]
     assert not table.should_report(trials)
     running.last_result = result("maddpg", 0, 200, -4.0)
-    # 100 env steps since the first result took 2 s; 800 are left here, and then 1000 of the one that waits.
+    # 100 env steps since the first result took 2 s; 800 are left here, and then all 500 of the one that waits.
     head, header, first, second = table.table(trials).splitlines()
-    assert head.endswith("about 0:00:36 left")
+    assert head.endswith("about 0:00:26 left")
     assert header.split("  ")[0] == "trial"
     assert first.split() == ["maddpg-seed0", "running", "200", "/", "1,000", "-4.0", "0.50", "3.0", "50", "0:00:16"]
-    assert second.split() == ["iddpg-seed0", "waiting", "0", "/", "1,000", "-", "-", "-", "-", "-"]
+    assert second.split() == ["iddpg-seed0", "waiting", "0", "/", "500", "-", "-", "-", "-", "-"]
+
+
+def test_a_trial_that_waits_is_as_fast_as_another_seed_of_its_algorithm() -> None:
+    table = ProgressTable(every_s=30.0)
+    slow = fake("maddpg", 0, 1000, status="RUNNING", last_result=result("maddpg", 0, 100, -5.0))
+    fast = fake("iddpg", 0, 1000, status="RUNNING", last_result=result("iddpg", 0, 100, -5.0))
+    waiting = fake("iddpg", 1, 2000, status="PENDING", last_result={})
+    trials = [slow, fast, waiting]
+    assert not table.should_report(trials)
+    slow.last_result = result("maddpg", 0, 200, -4.0)  # 50 env steps/s
+    fast.last_result = result("iddpg", 0, 200, -4.0) | {"time_total_s": 2.5}  # 200 env steps/s
+    # 16 s are left of the slow one, 4 s of the fast one, and then 10 s.
+    assert table.table(trials).splitlines()[0].endswith("about 0:00:16 left")
+    waiting.config["stop_timesteps"] = 4000
+    assert table.table(trials).splitlines()[0].endswith("about 0:00:24 left")
 
 
 # --- The command line ---------------------------------------------------------------------------------------------
@@ -269,6 +341,10 @@ def used(tmp_path: Path) -> Path:
         ("--resume --results-dir none", "none: leave --resume out, or correct --results-dir"),
         ("--results-dir used", "used is not empty: continue the run there with --resume, or choose another"),
         ("--results-dir used/experiment.json", "experiment.json is not a folder"),
+        (
+            "--results-dir used --resume --stop-timesteps 5",
+            "--stop-timesteps: the original run has what each row has for itself, and --resume continues it",
+        ),
         ("--results-dir used --resume --seeds 5", "--seeds: the original run has [0, 1, 2], and --resume continues it"),
     ],
 )
@@ -293,12 +369,16 @@ def test_settings_that_an_algorithm_refuses_end_before_anything_starts(
     with pytest.raises(SystemExit) as end:
         wrong.main(["--results-dir", str(tmp_path / "new")])
     assert end.value.code == 2
-    assert "tau must be a finite number" in capsys.readouterr().err
+    assert "tau=2.0 is illegal; legal: a number > 0 and <= 1" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_resume_takes_the_settings_of_the_original_run(used: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stored = json.loads((used / "experiment.json").read_text()) | {"seeds": [7, 8], "quick": True}
+    stored = json.loads((used / "experiment.json").read_text()) | {
+        "seeds": [7, 8],
+        "quick": True,
+        "stop_timesteps": 900,
+    }
     (used / "experiment.json").write_text(json.dumps(stored))
 
     def resume(name: str, *more: str) -> Any:
@@ -306,23 +386,133 @@ def test_resume_takes_the_settings_of_the_original_run(used: Path, capsys: pytes
         return parse(parser, name, ["--resume", "--results-dir", str(used), *more])
 
     args = resume("demo", "--workers", "4", "--seeds", "7", "8")
-    assert (args.seeds, args.quick, args.stop_timesteps, args.workers) == ([7, 8], True, 1000, 4)
+    assert (args.seeds, args.quick, args.stop_timesteps, args.workers) == ([7, 8], True, 900, 4)
     with pytest.raises(SystemExit):
         resume("another")
     assert "holds a run of demo, not of another" in capsys.readouterr().err
 
 
-def test_quick_changes_defaults_only() -> None:
-    args = parse(make_parser("demo", ["iddpg"], 10**6), "demo", ["--quick", "--stop-timesteps", "2e3"])
-    assert (args.stop_timesteps, args.seeds, args.no_compile) == (2000, [0], True)
-    assert args.results_dir == Path("results/demo-quick").resolve()
+ROWS = Experiment(
+    name="demo",
+    env="maobs/spread-3a",
+    algorithms=("tuned", "maddpg", "iddpg"),
+    quick_algorithms=("tuned", "maddpg"),
+    variants={
+        "tuned": {
+            "algorithm": "maddpg",
+            "actor_lr": decayed(1e-3),
+            "critic_state": "world",
+            "env_config": {"action_mode": "force"},
+            "train_horizon": 25,
+            "num_envs_per_env_runner": 32,
+            "one_policy": True,
+            "stop_timesteps": 200_000,
+            "steps_per_iteration": 2000,
+            "evaluation_duration": 20,
+            "quick": {"stop_timesteps": 60_000, "steps_per_iteration": 4000, "torch_compile": True},
+        }
+    },
+    training={"actor_lr": 1e-2, "tau": 0.02},
+    env_config={"num_obstacles": 3},
+    stop_timesteps=10**6,
+)
+
+
+def trial_settings(spec: Any) -> tuple[Any, ...]:
+    return spec.stop_timesteps, spec.steps_per_iteration, spec.evaluation_duration, spec.torch_compile
+
+
+def test_rows_have_settings_of_their_own() -> None:
+    tuned, maddpg, iddpg = ROWS.specs(parsed(ROWS, "--seeds", "7"))
+    assert trial_settings(tuned) == (200_000, 2000, 20, True)
+    assert trial_settings(maddpg) == trial_settings(iddpg) == (10**6, 1000, 10, True)
+    assert (maddpg.num_envs_per_env_runner, maddpg.one_policy, maddpg.training["actor_lr"]) == (8, False, 1e-2)
+    assert json.loads(json.dumps(asdict(tuned))) == asdict(tuned)  # plain values, as Tune writes them
+    config = tuned.build_config()
+    config.validate()
+    evaluation = config.get_evaluation_config_object()
+    assert config.actor_lr == [[0, 1e-3], [100_000, 1e-3], [200_000, 5e-5]]
+    assert (config.tau, config.critic_state, config.num_envs_per_env_runner) == (0.02, "world", 32)
+    assert config.env_config == {"num_obstacles": 3, "action_mode": "force", "horizon": 25}
+    assert evaluation.env_config == {**config.env_config, "horizon": 100}
+    assert evaluation.num_envs_per_env_runner == 20
+    assert config.module_ids == ("all", "all", "all")
+
+
+def test_what_is_given_holds_for_all_rows() -> None:
+    specs = ROWS.specs(parsed(ROWS, "--stop-timesteps", "2e3", "--train-horizon", "50", "--no-compile", "--seeds", "0"))
+    assert [spec.stop_timesteps for spec in specs] == [2000] * 3
+    assert [spec.env_config["horizon"] for spec in specs] == [50] * 3
+    assert not any(spec.torch_compile for spec in specs)
+    assert specs[0].training["actor_lr"][1:] == [[1000, 1e-3], [2000, 5e-5]]
+
+
+def test_quick_changes_what_is_not_given() -> None:
+    args = parsed(ROWS, "--quick")
+    tuned, maddpg = ROWS.specs(args)
+    assert (args.algos, args.seeds) == (["tuned", "maddpg"], [0])
+    assert trial_settings(tuned) == (60_000, 4000, 5, True)
+    assert trial_settings(maddpg) == (4000, 400, 5, False)
+    args = parsed(ROWS, "--quick", "--stop-timesteps", "2e3", "--algos", "iddpg", "tuned")
+    assert [trial_settings(spec) for spec in ROWS.specs(args)] == [(2000, 400, 5, False), (2000, 4000, 5, True)]
+    assert parsed(replace(ROWS, quick_algorithms=()), "--quick").algos == list(ROWS.algorithms)
+    named = parse(make_parser("demo", ["iddpg"], 10**6), "demo", ["--quick"])
+    assert named.results_dir == Path("results/demo-quick").resolve()
+
+
+def test_the_plan_of_a_quick_run_measures_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    def plan(*arguments: str) -> str:
+        args = parsed(ROWS, "--quick", *arguments)
+        ROWS._print_plan(args, ROWS.specs(args))
+        return capsys.readouterr().out
+
+    assert "--quick trains tuned and maddpg only: iddpg need hours" in plan()
+    out = plan("--algos", "maddpg", "iddpg")
+    assert "only" not in out and "at most about five minutes" in out
+    assert [line.split() for line in out.splitlines() if line.startswith(("maddpg", "iddpg"))] == [
+        ["maddpg", "4,000", "1"],
+        ["iddpg", "4,000", "1"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"algorithm": "madpg"}, "Row 'a': unknown algorithm 'madpg'; legal are iddpg, maddpg"),
+        ({}, "Row 'a': unknown algorithm ''; legal are iddpg"),
+        (
+            {"algorithm": "maddpg", "actr_lr": 1.0},
+            r"Row 'a' has no setting 'actr_lr' \(did you mean 'actor_lr'\?\); legal are env_config, train_horizon, "
+            r".*, quick, and arguments of training\(\): other_agents_actions, actor_lr, .*gamma",
+        ),
+        ({"algorithm": "iddpg", "other_agents_actions": "joint"}, "has no setting 'other_agents_actions'"),
+        ({"algorithm": "maddpg", "stop_timesteps": 0}, "stop_timesteps=0 is illegal; legal: an integer >= 1"),
+        (
+            {"algorithm": "maddpg", "quick": {"stop_steps": 5}},
+            "Row 'a', quick has no setting 'stop_steps' .did you mean",
+        ),
+        ({"algorithm": "maddpg", "lr": 1e-3}, "Row 'a' has no setting 'lr'"),
+        ({"algorithm": "maddpg", "quick": {"quick": {}}}, "Row 'a', quick has no setting 'quick'"),
+        ({"algorithm": "maddpg", "quick": True}, "quick=True is illegal; legal: a mapping of settings"),
+    ],
+)
+def test_rows_with_unknown_settings_are_refused(row: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(EXPERIMENT, algorithms=("a",), variants={"a": row})
+
+
+def test_quick_algorithms_are_some_of_all() -> None:
+    with pytest.raises(ValueError, match="Unknown quick_algorithms 'facmac'; legal are those of algorithms: iddpg, ma"):
+        replace(EXPERIMENT, quick_algorithms=("iddpg", "facmac"))
 
 
 # --- The scripts --------------------------------------------------------------------------------------------------
 
 
-def load_script(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+def load_script(script: str | Path) -> Any:
+    """A script of `tuned_examples` by its name, or one that lies elsewhere."""
+    path = script if isinstance(script, Path) else SCRIPTS / f"{script}.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -332,6 +522,7 @@ def load_script(name: str) -> Any:
 
 FIVE = ("iddpg", "maddpg", "maddpg-lstm", "maddpg-l", "facmac")
 FOUR = FIVE[:4]
+TUNED = "maddpg-entity"
 
 
 @pytest.mark.parametrize(
@@ -352,11 +543,10 @@ def test_scripts_have_the_settings_of_the_paper(
     script: str, algorithms: tuple[str, ...], agents: int, critic_lr: float, batch: int, seq_length: int
 ) -> None:
     experiment = load_script(script).experiment
-    assert experiment.algorithms == algorithms
+    assert tuple(name for name in experiment.algorithms if name != TUNED) == algorithms
     assert experiment.stop_timesteps == 2_000_000
-    parser = make_parser(experiment.name, experiment.algorithms, experiment.stop_timesteps)
-    arguments = ["--train-horizon", "25", "--critic-state", "world", "--seeds", "5", "6", "--results-dir", "new"]
-    specs = experiment.specs(parse(parser, experiment.name, arguments))
+    arguments = ["--train-horizon", "25", "--critic-state", "world", "--seeds", "5", "6"]
+    specs = experiment.specs(parsed(experiment, *arguments, "--algos", *algorithms))
     count = len(algorithms)
     assert [(spec.algorithm, spec.seed) for spec in specs] == [(a, s) for s in (5, 6) for a in algorithms]
     for spec in specs[:count]:
@@ -367,6 +557,7 @@ def test_scripts_have_the_settings_of_the_paper(
         assert (config.actor_lr, config.critic_lr, config.gamma) == (0.001, critic_lr, 0.95)
         assert (config.train_batch_size_per_learner, config.seq_length) == (batch, seq_length)
         assert (config.seed, config.critic_state, config.torch_compile_learner) == (5, "world", True)
+        assert (spec.stop_timesteps, spec.num_envs_per_env_runner, spec.one_policy) == (2_000_000, 8, False)
         # Training episodes are short, evaluation is the paper's: 10 noise-free episodes of 100 steps.
         evaluation = config.get_evaluation_config_object()
         assert (config.env_config["horizon"], evaluation.env_config["horizon"]) == (25, 100)
@@ -374,20 +565,47 @@ def test_scripts_have_the_settings_of_the_paper(
         assert (config.evaluation_interval, config.evaluation_duration) == (1, 10)
 
 
-def test_variants_have_settings_of_their_own() -> None:
+@pytest.mark.parametrize(
+    ("script", "agents"),
+    [
+        ("obstacle_predator_prey", 3),
+        ("spread3a", 3),
+        ("spread6a", 6),
+        ("spread9a", 9),
+        ("tunnel", 3),
+        ("simple_tunnel", 3),
+        ("simple_tunnel6a", 6),
+    ],
+)
+def test_scripts_have_a_row_that_learns_in_minutes(script: str, agents: int) -> None:
+    experiment = load_script(script).experiment
+    row = experiment.variants[TUNED]
+    steps = row["stop_timesteps"]
+    tuned = next(spec for spec in experiment.specs(parsed(experiment)) if spec.algorithm == TUNED)
+    config = tuned.build_config()
+    config.validate()
+    assert (tuned.stop_timesteps, config.num_envs_per_env_runner) == (steps, 32)
+    assert (config.name, config.actor, config.critic, config.critic_state) == ("maddpg", "entity", "entity", "world")
+    assert config.module_ids == ("all",) * agents
+    assert config.critic_lr == [[0, 1e-3], [steps // 2, 1e-3], [steps, 5e-5]]
+    assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"]}
+    assert tuned.evaluation_options == {"action_mode": "force", "horizon": 100}
+    quick = experiment.specs(parsed(experiment, "--quick"))
+    assert [spec.name for spec in quick] == ["maddpg-entity-seed0", "maddpg-seed0"]
+    small = row["quick"]["stop_timesteps"]
+    assert small < steps / 3
+    assert [trial_settings(spec) for spec in quick] == [(small, 4000, 20, True), (4000, 400, 5, False)]
+
+
+def test_variants_have_settings_that_depend_on_the_env_steps() -> None:
     experiment = load_script("facmac_two_stage").experiment
-    parser = make_parser(experiment.name, experiment.algorithms, experiment.stop_timesteps)
     for steps in (2_000_000, 3000):
-        arguments = ["--stop-timesteps", str(steps), "--results-dir", "new"]
-        two_stage, whole = experiment.specs(parse(parser, experiment.name, arguments))[:2]
+        two_stage, whole = experiment.specs(parsed(experiment, "--stop-timesteps", str(steps)))[:2]
         assert two_stage.build_config().mixer_start == steps // 2
         assert whole.build_config().mixer_start == 0
     sources = load_script("facmac_critic_source").experiment
-    parser = make_parser(sources.name, sources.algorithms, sources.stop_timesteps)
-    for spec in sources.specs(parse(parser, sources.name, ["--results-dir", "new"])):
+    for spec in sources.specs(parsed(sources)):
         assert spec.build_config().critic_source == spec.algorithm
-    with pytest.raises(ValueError, match="Unknown algorithms 'madpg'; legal are iddpg, maddpg"):
-        Experiment(name="x", env="maobs/tunnel", algorithms=("a",), variants={"a": {"algorithm": "madpg"}}, training={})
 
 
 # --- Tune's saved state -------------------------------------------------------------------------------------------
@@ -443,8 +661,38 @@ def test_the_release_of_ray_that_is_known_is_the_one_that_is_required() -> None:
 
 # --- A whole run --------------------------------------------------------------------------------------------------
 
-STOP = 2000
-TRIALS = ("iddpg-seed0", "maddpg-seed0", "maddpg-l-seed0")
+# Trials with env steps of their own; the second one's agents share a policy with entity networks.
+STOPS = {"iddpg-seed0": 2000, "entity-seed0": 1600, "maddpg-l-seed0": 2000}
+TRIALS = tuple(STOPS)
+SCRIPT = """
+from rllib_maobs.experiment import Experiment
+
+experiment = Experiment(
+    name="small",
+    env="maobs/spread-3a",
+    algorithms=("iddpg", "entity", "maddpg-l", "facmac"),
+    quick_algorithms=("iddpg", "entity", "maddpg-l"),
+    variants={
+        "iddpg": {"algorithm": "iddpg", "quick": {"stop_timesteps": 2000}},
+        "entity": {
+            "algorithm": "maddpg",
+            "actor": "entity",
+            "critic": "entity",
+            "critic_state": "world",
+            "updates_per_env_step": 1 / 8,
+            "one_policy": True,
+            "env_config": {"action_mode": "force"},
+            "train_horizon": 25,
+            "quick": {"stop_timesteps": 1600, "steps_per_iteration": 800, "evaluation_duration": 2},
+        },
+        "maddpg-l": {"algorithm": "maddpg-l", "quick": {"stop_timesteps": 2000}},
+    },
+    training={"train_batch_size_per_learner": 64},
+)
+
+if __name__ == "__main__":
+    experiment.main()
+"""
 
 
 def read_results(trial: Path) -> list[dict[str, Any]]:
@@ -478,11 +726,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     """A quick run, in which a trial's process is killed and which is then interrupted; and then resumed."""
     folder = tmp_path_factory.mktemp("run")
     results = folder / "results"
-    command = [sys.executable, str(SCRIPTS / "spread3a.py"), "--results-dir", str(results)]
+    script = folder / "small.py"
+    script.write_text(SCRIPT)
+    command = [sys.executable, str(script), "--results-dir", str(results)]
     # Tune copies results to the folder with each checkpoint; with one an iteration the first trial is killed early, and
     # has checkpoints to write after it is resumed: there a decision that is not forgotten would stop it.
-    first = [*command, "--quick", "--stop-timesteps", str(STOP), "--checkpoint-freq", "1"]
-    first += ["--algos", "iddpg", "maddpg", "maddpg-l"]
+    first = [*command, "--quick", "--checkpoint-freq", "1"]
     with subprocess.Popen(first, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             killed = wait_for(lambda: read_results(results / TRIALS[0])[1:], process)
@@ -492,19 +741,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
             output, _ = process.communicate(timeout=600)
         finally:
             process.kill()
-    assert len(read_results(results / TRIALS[0])) < STOP // 400 - 1, (
+    assert len(read_results(results / TRIALS[0])) < STOPS[TRIALS[0]] // 400 - 1, (
         "killed so late that it has no checkpoint left to write"
     )
     died_while_saving(results, "iddpg")
     resumed = subprocess.run([*command, "--resume"], cwd=folder, capture_output=True, text=True, timeout=600)
-    yield SimpleNamespace(results=results, code=process.returncode, output=output, resumed=resumed)
+    yield SimpleNamespace(results=results, script=script, code=process.returncode, output=output, resumed=resumed)
 
 
 def test_the_plan_is_printed_first(run: SimpleNamespace) -> None:
     plan, table, _ = run.output.partition(" since the start")
     assert table
-    assert "spread-3a: 3 trials, iddpg, maddpg, maddpg-l with seed 0\n2,000 env steps each, 1 update(s)" in plan
-    assert "Measured with 2 at once in" in plan
+    assert "small: 3 trials, iddpg, entity, maddpg-l with seed 0\n--quick trains iddpg and entity and maddpg-l" in plan
+    assert ["entity", "1,600", "0.125"] in [line.split() for line in plan.splitlines()]
     assert f"TensorBoard: tensorboard --logdir {run.results}" in plan
 
 
@@ -517,8 +766,9 @@ def test_a_failed_trial_and_an_interruption_are_reported(run: SimpleNamespace) -
 def test_a_resumed_run_goes_on_where_it_was(run: SimpleNamespace) -> None:
     assert run.resumed.returncode == 0, run.resumed.stdout + run.resumed.stderr
     curves = load_curves(run.results)
-    for trial in TRIALS:
-        assert curves.loc[curves["trial"] == trial, "env_steps"].tolist() == [400, 800, 1200, 1600, 2000]
+    for trial, steps in (("iddpg", 400), ("entity", 800), ("maddpg-l", 400)):
+        done = curves.loc[curves["trial"] == f"{trial}-seed0", "env_steps"].tolist()
+        assert done == list(range(steps, STOPS[f"{trial}-seed0"] + 1, steps))
     # It was killed after its first checkpoint: another process made the iterations that follow, and only those.
     first, *_, last = read_results(run.results / TRIALS[0])
     assert first["pid"] != last["pid"]
@@ -526,25 +776,89 @@ def test_a_resumed_run_goes_on_where_it_was(run: SimpleNamespace) -> None:
 
 
 def test_everything_promised_is_written(run: SimpleNamespace) -> None:
-    assert "| maddpg-l " in (run.results / "comparison.md").read_text()
+    text = (run.results / "comparison.md").read_text()
+    assert "| maddpg-l " in text and "last 3 evaluations" in text
+    assert "![learning curves](curves.png)\n\n![an episode of " in text and "(episode.gif)" in text
     comparison = pd.read_csv(run.results / "comparison.csv")
-    assert sorted(comparison["algorithm"]) == ["iddpg", "maddpg", "maddpg-l"]
+    assert sorted(comparison["algorithm"]) == ["entity", "iddpg", "maddpg-l"]
     assert np.isfinite(comparison[["score", "coverage", "collisions", "collision_free", "hours"]]).all(axis=None)
-    assert len(pd.read_csv(run.results / "curves.csv")) == 3 * STOP // 400
+    assert len(pd.read_csv(run.results / "curves.csv")) == 2 * 5 + 2
     assert colours(run.results / "curves.png") > 10
     for trial in TRIALS:
         folder = run.results / trial
         assert any(path.stat().st_size > 1000 for path in folder.glob("events.out.tfevents.*"))
         progress = pd.read_csv(folder / "progress.csv")
-        assert progress[STEPS].tolist() == list(range(400, STOP + 1, 400))
-        # No training episode ends in the first iteration, so this is a column that was not there at first.
+        assert progress[STEPS].iloc[-1] == STOPS[trial]
         assert progress["env_runners/episode_return_mean"].notna().any()
+    # No training episode ends in the first iteration, so this is a column that was not there at first.
+    assert np.isnan(pd.read_csv(run.results / TRIALS[0] / "progress.csv")["env_runners/episode_return_mean"].iloc[0])
+
+
+def test_the_best_is_filmed(run: SimpleNamespace) -> None:
+    best = pd.read_csv(run.results / "comparison.csv")["algorithm"].iloc[0]
+    film = run.results / "episode.gif"
+    assert f"An episode of {best}-seed0, the best one: {film}\n" in run.resumed.stdout
+    assert Image.open(film).n_frames == 101
+
+
+def test_a_film_that_fails_says_why(run: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one of agents that were trained with other options of the environment is filmed with these."""
+    results = tmp_path / "results"
+    shutil.copytree(run.results, results)
+    experiment = load_script(run.script).experiment
+    specs = experiment.specs(parsed(experiment, "--quick"))
+    others = ["iddpg-seed0", "maddpg-l-seed0"]
+    assert film_best(results, specs, others) == f"An episode of entity-seed0, the best one: {results / 'episode.gif'}"
+    assert (results / "comparison.md").read_text().endswith("\n![an episode of entity-seed0](episode.gif)\n")
+    assert film_best(results, specs, TRIALS) == "No film: nothing has been evaluated."
+    foreign = [replace(spec, env="mine") for spec in specs]
+    assert film_best(results, foreign) == "No film: mine is not an environment of this package."
+    monkeypatch.setitem(sys.modules, "pygame", None)  # as if it were not installed
+    said = film_best(results, specs, others)
+    assert said == 'No film: pictures need pygame: pip install "rllib-maobs[render]"'
+    assert not (results / "episode.gif").exists()
 
 
 def test_checkpoints_can_be_trained_on(run: SimpleNamespace, ray_session: None) -> None:
     (checkpoint,) = (run.results / "maddpg-l-seed0").glob("checkpoint_*")
     algorithm = Algorithm.from_checkpoint(str(checkpoint))
     try:
-        assert algorithm.train()[STEPS] == STOP + 400
+        assert algorithm.train()[STEPS] == STOPS["maddpg-l-seed0"] + 400
     finally:
         algorithm.stop()
+
+
+# --- One trial ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def predators() -> Any:
+    """The tuned row of predator-prey, small: learning starts after 80 env steps, and it is done after 300."""
+    experiment = load_script("obstacle_predator_prey").experiment
+    small = {"num_random_steps": 40, "num_steps_sampled_before_learning_starts": 80, "num_envs_per_env_runner": 4}
+    small |= {"train_batch_size_per_learner": 16, "steps_per_iteration": 160, "evaluation_duration": 1}
+    return replace(experiment, variants={TUNED: {**experiment.variants[TUNED], **small, "stop_timesteps": 300}})
+
+
+def test_a_trial_is_done_at_its_own_env_steps(ray_session: None, predators: Experiment) -> None:
+    spec = predators.specs(parsed(predators, "--algos", TUNED, "--no-compile"))[0]
+    trial = Trial(config=asdict(spec))
+    try:
+        first, second = trial.train(), trial.train()
+    finally:
+        trial.stop()
+    assert (first[STEPS], first["done"]) == (160, False)
+    assert (second[STEPS], second["done"]) == (320, True)
+    assert "all" in second["learners"] and "predator_0" not in second["learners"]
+
+
+def test_a_full_run_measures_how_long_it_takes(
+    ray_session: None, predators: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = parsed(predators, "--algos", TUNED, "--quick", "--stop-timesteps", "300", "--no-compile")
+    args.results_dir = tmp_path
+    predators._print_plan(args, predators.specs(args))
+    out = capsys.readouterr().out
+    assert "Measured with 1 at once in" in out and "Replay will take up to 0 MB" in out
+    (row,) = [line.split() for line in out.splitlines() if line.startswith("maddpg-entity")]
+    assert row[1:3] == ["300", "0.125"] and float(row[3]) > 1.0

@@ -177,6 +177,69 @@ def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
         make_policy(env, path)
 
 
+@pytest.fixture(scope="module")
+def entity_checkpoint(ray_session, tmp_path_factory):
+    """Three agents with one policy of entity networks, which has learned a little."""
+    config = small_config("maddpg", action_mode="force").training(actor="entity", critic="entity", critic_state="world")
+    config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *args, **kwargs: "all")
+    algo = config.build_algo()
+    algo.train()
+    path = algo.save_to_path(str(tmp_path_factory.mktemp("entity")))
+    module = algo.get_module("all")
+    yield path, module
+    algo.stop()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "options"),
+    [
+        ("spread-9a", {}),
+        ("spread-3a", {"num_agents": 1}),
+        ("spread-3a", {}),
+        # As long an observation as the one of the training, of other things.
+        ("spread-3a", {"num_agents": 4, "num_obstacles": 0}),
+    ],
+)
+def test_entity_networks_play_in_teams_of_another_size(entity_checkpoint, scenario, options):
+    path, module = entity_checkpoint
+    env = parallel_env(scenario, action_mode="force", horizon=4, **options)
+    policy = make_policy(env, path)
+    observations, _ = env.reset(seed=0)
+    actions = policy(observations)
+    for agent, observation in observations.items():
+        here = module.for_layout(env.observation_layouts[agent])
+        with torch.no_grad():
+            expected = here.forward_inference({"obs": torch.from_numpy(observation)[None]})["actions"][0]
+        np.testing.assert_allclose(actions[agent], expected.numpy(), rtol=1e-5, atol=1e-6)
+    assert len({id(acting) for acting in policy._acting.values()}) == 1
+    assert set(play(env, policy)) > {"return_mean", "coverage"}
+
+
+def test_networks_of_one_size_say_so(entity_checkpoint, maddpg_checkpoint):
+    path, _ = maddpg_checkpoint
+    with pytest.raises(
+        ValueError, match=r"was trained on \(18,\)\. Networks that act in teams of any size are those of tr"
+    ):
+        make_policy(parallel_env("spread-3a", num_obstacles=10), path)
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        (
+            "mpe",
+            r"agent_0 has actions \(5,\) in Spread\(.*\), but was trained with \(2,\): give the environment the "
+            "options of the training, such as action_mode=force$",
+        ),
+        ("discrete", r"agent_0 has actions 0 to 4 in Spread\(.*, but was trained with \(2,\)"),
+    ],
+)
+def test_other_actions_than_in_training_are_named(entity_checkpoint, mode, message):
+    path, _ = entity_checkpoint
+    with pytest.raises(ValueError, match=message):
+        make_policy(parallel_env("spread-9a", action_mode=mode), path)
+
+
 @pytest.mark.parametrize("use_lstm", [False, True])
 @pytest.mark.parametrize("mode", ["mpe", "discrete"])
 def test_checkpoint_of_stock_ppo_with_one_policy_for_all(ray_session, tmp_path, mode, use_lstm):

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-PAPER_HORIZON = 100
+from rllib_maobs.experiment.rows import PAPER_HORIZON
+from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
+
 _FILE = "experiment.json"
 _BEFORE_START = (_FILE, "tuner.pkl")  # What is written before the first trial starts.
 # What --quick changes; a flag that is given still wins.
-QUICK = {"seeds": [0], "stop_timesteps": 4000, "no_compile": True, "checkpoint_freq": 2}
+QUICK = {"seeds": [0], "checkpoint_freq": 2}
 # What decides the results: a resumed run must have the same.
 SETTINGS = (
     "algos",
@@ -61,39 +63,50 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def make_parser(
-    name: str, algos: Sequence[str], stop_timesteps: int, doc: str | None = None
+    name: str, algos: Sequence[str], stop_timesteps: int, doc: str | None = None, quick_algos: Sequence[str] = ()
 ) -> argparse.ArgumentParser:
     """Build the command line.
 
     Args:
         name: Of the experiment.
         algos: Legal algorithms.
-        stop_timesteps: Default env steps of a trial.
+        stop_timesteps: Env steps of a trial that has none of its own.
         doc: Description.
+        quick_algos: Those of a quick run; none for all.
 
     Returns:
         The parser.
     """
-    quick = f"{QUICK['stop_timesteps']} env steps, seed 0, no compiling; flags that are given still count"
+    quick = f"{' and '.join(quick_algos)}, " if quick_algos else ""
+    quick += (
+        f"seed 0, {QUICK_ROW['stop_timesteps']} env steps without compiling but for rows that say otherwise; flags "
+        f"that are given still count"
+    )
     positive, natural, seed = _whole_number(1), _whole_number(0), _whole_number(0, 2**32 - 1)
     parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
     what = parser.add_argument_group("what to train")
     what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
     what.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2], help="one trial per algorithm and seed")
-    what.add_argument("--stop-timesteps", type=positive, default=stop_timesteps, help="env steps of every trial")
+    # None: each row has its own, and what is given here holds for all.
+    what.add_argument(
+        "--stop-timesteps",
+        type=positive,
+        help=f"env steps of every trial (default: {stop_timesteps:,}, or what a row has for itself)",
+    )
     what.add_argument(
         "--train-horizon",
         type=positive,
-        default=PAPER_HORIZON,
-        help=f"steps of a training episode; evaluation episodes always have {PAPER_HORIZON}",
+        help=f"steps of a training episode (default: {PAPER_HORIZON}, or what a row has for itself); evaluation "
+        f"episodes always have {PAPER_HORIZON}",
     )
     what.add_argument(
         "--critic-state",
         choices=["observations", "world"],
         default="observations",
-        help="the state that centralised critics see: all observations side by side, or the positions and velocities",
+        help="the state that centralised critics see: all observations side by side, or the positions and velocities; "
+        "rows with a critic_state of their own keep it",
     )
-    what.add_argument("--quick", action="store_true", help=f"the same job in a few minutes: {quick}")
+    what.add_argument("--quick", action="store_true", help=f"a small job of about five minutes: {quick}")
 
     how = parser.add_argument_group("how to run it")
     how.add_argument("--workers", type=positive, default=2, help="trials at once on this machine, one core each")
@@ -118,7 +131,10 @@ def make_parser(
         help=f"folder for everything that is written (default: results/{name}, with --quick results/{name}-quick)",
     )
     where.add_argument(
-        "--checkpoint-freq", type=positive, default=50, help="iterations (of 1000 env steps) between checkpoints"
+        "--checkpoint-freq",
+        type=positive,
+        default=50,
+        help="iterations (of 1000 env steps, or what a row has for itself) between checkpoints",
     )
     where.add_argument(
         "--resume",
@@ -128,20 +144,23 @@ def make_parser(
     return parser
 
 
-def parse(parser: argparse.ArgumentParser, name: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
+def parse(
+    parser: argparse.ArgumentParser, name: str, argv: Sequence[str] | None = None, quick_algos: Sequence[str] = ()
+) -> argparse.Namespace:
     """Read the command line; errors end the program with a message and code 2, before anything is started.
 
     Args:
         parser: From `make_parser`.
         name: Of the experiment.
         argv: Arguments; None for those of the program.
+        quick_algos: Algorithms of a quick run; none for all.
 
     Returns:
         The arguments, with an absolute `results_dir`; those of the original run with `--resume`.
     """
     args = parser.parse_args(argv)
     if args.quick:
-        parser.set_defaults(**QUICK)
+        parser.set_defaults(**QUICK, **({"algos": list(quick_algos)} if quick_algos else {}))
         args = parser.parse_args(argv)
     for flag in ("algos", "seeds"):
         values = getattr(args, flag)
@@ -182,8 +201,9 @@ def _with_stored_settings(
     for name, value in stored.items():
         if getattr(args, name) != value:
             flag = f"--{name.replace('_', '-')}"
+            stands = "what each row has for itself" if value is None else value
             parser.error(
-                f"{flag}: the original run has {value}, and --resume continues it as it is: leave {flag} out, or "
+                f"{flag}: the original run has {stands}, and --resume continues it as it is: leave {flag} out, or "
                 f"start a new run in another --results-dir"
             )
     return args

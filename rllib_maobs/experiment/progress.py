@@ -26,12 +26,10 @@ class ProgressTable(ProgressReporter):
     """Prints a line per trial: status, env steps, score, coverage, collisions, speed, time left.
 
     Args:
-        stop_timesteps: Env steps of a trial.
         every_s: Seconds between tables.
     """
 
-    def __init__(self, stop_timesteps: int, every_s: float) -> None:
-        self._stop_timesteps = stop_timesteps
+    def __init__(self, every_s: float) -> None:
         self._every_s = every_s
         self._started = self._reported = time.monotonic()
         # Trial id -> env steps and seconds of its first result since it started: where its speed is counted from, for
@@ -72,19 +70,22 @@ class ProgressTable(ProgressReporter):
         shown = [SCORE, headline, "collisions"]
         speeds = [self._speed(trial) for trial in trials]
         known = [speed for speed in speeds if speed]
+        of_its_kind = {trial.config["algorithm"]: speed for trial, speed in zip(trials, speeds, strict=True) if speed}
         rows, remaining = [], []
         for trial, values, speed in zip(trials, metrics, speeds, strict=True):
             status = _STATUS.get(trial.status, "waiting")
-            steps = int(trial.last_result.get(STEPS, 0))
+            steps, stop = int(trial.last_result.get(STEPS, 0)), trial.config["stop_timesteps"]
             left = None
             if status in ("running", "waiting") and known:
-                left = max(self._stop_timesteps - steps, 0) / (speed or sum(known) / len(known))
+                # Of one that has no speed yet: that of another seed, or else of the others.
+                guess = of_its_kind.get(trial.config["algorithm"], sum(known) / len(known))
+                left = max(stop - steps, 0) / (speed or guess)
                 remaining.append(left)
             rows.append(
                 [
                     str(trial),
                     status,
-                    f"{steps:,} / {self._stop_timesteps:,}",
+                    f"{steps:,} / {stop:,}",
                     *(format_metric(name, values[name]) if name in values else "-" for name in shown),
                     f"{speed:.0f}" if speed else "-",
                     format_time(left if status == "running" else None),

@@ -29,9 +29,14 @@ LABELS = {
     "collisions": "collisions / episode",
     "collision_free": "collision-free",
 }
-# Evaluations at the end of a trial whose mean is its result.
+# Evaluations at the end of a trial whose mean is its result; and of one of a quick run.
 LAST = 10
+LAST_QUICK = 3
 STEPS = "num_env_steps_sampled_lifetime"
+FILM = "episode.gif"
+# How lines of policies that are not trained are drawn, and from which ratio on scores get a logarithmic axis.
+_STYLES = (":", "--", "-.")
+_MUCH = 5.0
 
 
 def evaluation_metrics(result: Mapping[str, Any]) -> dict[str, float]:
@@ -139,7 +144,7 @@ def summarise(curves: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
     if "all_covered" in measures:
         measures.remove("success")  # It is the same there.
     by_trial = curves.groupby(["algorithm", "trial"], sort=False)
-    trials = by_trial[measures].agg(lambda column: column.tail(last).mean())
+    trials = _by_trial(curves, measures, last)
     end = by_trial[["env_steps", "time_total_s"]].last()
     trials["env_steps"] = end["env_steps"]
     trials["env_steps_per_s"] = end["env_steps"] / end["time_total_s"]
@@ -153,6 +158,31 @@ def summarise(curves: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
         table.insert(table.columns.get_loc(SCORE) + 1, "score_std", by_algorithm[SCORE].std())
         table = table.sort_values(SCORE, ascending=False)
     return table
+
+
+def _by_trial(curves: pd.DataFrame, measures: list[str], last: int) -> pd.DataFrame:
+    """Return the results of each trial, by algorithm and trial."""
+    by_trial = curves.groupby(["algorithm", "trial"], sort=False)
+    return by_trial[measures].agg(lambda column: column.tail(last).mean())
+
+
+def best_trial(curves: pd.DataFrame, last: int = LAST) -> str | None:
+    """Return the best trial of the best algorithm, by score.
+
+    Args:
+        curves: From `load_curves`.
+        last: See `summarise`.
+
+    Returns:
+        Its name; None if nothing has a score.
+    """
+    if SCORE not in curves:
+        return None
+    scores = _by_trial(curves, [SCORE], last)[SCORE].dropna()
+    if scores.empty:
+        return None
+    algorithm = scores.groupby("algorithm", sort=False).mean().idxmax()
+    return str(scores[algorithm].idxmax())
 
 
 def to_markdown(table: pd.DataFrame, baselines: Mapping[str, Mapping[str, float]] | None = None) -> str:
@@ -175,10 +205,15 @@ def to_markdown(table: pd.DataFrame, baselines: Mapping[str, Mapping[str, float]
             cells[3 + measures.index(SCORE)] += f" ± {row['score_std']:.1f}"
         rows.append([*cells, f"{row['env_steps_per_s']:.0f}", format_time(3600 * row["hours"])])
     for policy, metrics in (baselines or {}).items():
-        measured = {**_with_collisions(metrics), SCORE: metrics["return_agent_0"]}
+        measured = _measured(metrics)
         cells = [format_metric(name, measured[name]) if name in measured else "-" for name in measures]
         rows.append([policy, "-", "-", *cells, "-", "-"])
     return format_table(header, rows, markdown=True)
+
+
+def _measured(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the metrics of a policy that is not trained, called as those of trials are."""
+    return {**_with_collisions(metrics), SCORE: metrics["return_agent_0"]}
 
 
 def format_metric(name: str, value: float) -> str:
@@ -186,16 +221,25 @@ def format_metric(name: str, value: float) -> str:
     return f"{value:.1f}" if name in (SCORE, "collisions", "captures") else f"{value:.2f}"
 
 
-def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points: int = 50) -> None:
+def plot_curves(
+    curves: pd.DataFrame,
+    path: str | Path,
+    title: str = "",
+    points: int = 50,
+    baselines: Mapping[str, Mapping[str, float]] | None = None,
+) -> None:
     """Draw score and coverage (or success, for tasks without targets to share) against env steps.
 
-    Each algorithm is a line, the mean over its seeds, in a band from its worst to its best seed.
+    Each algorithm is a line, the mean over its seeds, in a band from its worst to its best seed. Policies that are not
+    trained are horizontal lines. Scores that are all negative and differ much, as sums of distances do, are drawn on a
+    logarithmic axis: else random play leaves no room for what is good.
 
     Args:
         curves: From `load_curves`.
         path: The picture's file; its ending chooses the format.
         title: Written above.
         points: Evaluations are averaged to at most so many points per line.
+        baselines: Metrics of policies that are not trained, from `play_baselines`.
     """
     # The figure is drawn without pyplot: no window, no global state, whatever backend a notebook has chosen.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -205,22 +249,47 @@ def plot_curves(curves: pd.DataFrame, path: str | Path, title: str = "", points:
     width = max(int(curves["env_steps"].max()) / points, 1.0)
     binned = curves.assign(bin=np.ceil(curves["env_steps"] / width))
     by_trial = binned.groupby(["algorithm", "trial", "bin"], sort=False)[["env_steps", *shown]].mean()
+    levels = {policy: _measured(metrics) for policy, metrics in (baselines or {}).items()}
 
     figure = Figure(figsize=(6.0 * len(shown), 4.2), layout="constrained")
     FigureCanvasAgg(figure)
+    lines: dict[str, Any] = {}  # one legend for all panels
     for axes, name in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         for algorithm, trials in by_trial.groupby("algorithm", sort=False):
             bins = trials.groupby("bin")
             steps, seeds = bins["env_steps"].mean(), bins[name]
-            (line,) = axes.plot(steps, seeds.mean(), label=algorithm, marker="o" if len(steps) < 10 else "")
+            (line,) = axes.plot(steps, seeds.mean(), marker="o" if len(steps) < 10 else "")
+            lines.setdefault(str(algorithm), line)
             axes.fill_between(steps, seeds.min(), seeds.max(), color=line.get_color(), alpha=0.2, linewidth=0)
+        here = {policy: level[name] for policy, level in levels.items() if name in level}
+        for (policy, level), style in zip(here.items(), _STYLES, strict=False):
+            lines.setdefault(policy, axes.axhline(level, color="0.35", linestyle=style, linewidth=1.2))
+        if name == SCORE:
+            _scale_scores(axes, [*by_trial[name].dropna(), *here.values()])
         axes.set_xlabel("env steps")
         axes.set_ylabel("score (return of the first agent)" if name == SCORE else LABELS[name])
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.grid(alpha=0.3)
-        axes.legend()
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
     if title:
         figure.suptitle(title)
     figure.savefig(path, dpi=150)
+
+
+def _scale_scores(axes: Any, values: list[float]) -> None:
+    """Make the axis of scores logarithmic if they are all negative and differ much."""
+    from matplotlib.ticker import FixedLocator
+
+    if not values or max(values) >= 0 or min(values) > _MUCH * max(values):
+        return
+    best, worst = -max(values), -min(values)
+    low, high = best / 1.25, worst * 1.25
+    axes.set_yscale("function", functions=(lambda y: -np.log(np.maximum(-y, 1e-9)), lambda y: -np.exp(-y)))
+    axes.set_ylim(-high, -low)
+    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    ticks = [-digit * 10.0**decade for decade in decades for digit in (1, 2, 5)]
+    axes.yaxis.set_major_locator(FixedLocator([tick for tick in ticks if low <= -tick <= high]))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value <= -1 else f"{value:g}")
 
 
 def write_report(
@@ -228,6 +297,7 @@ def write_report(
     title: str,
     failed: Collection[str] = (),
     baselines: Mapping[str, Mapping[str, float]] | None = None,
+    last: int = LAST,
 ) -> str:
     """Write the `FILES` into the results folder, and complete the trials' progress.csv.
 
@@ -236,6 +306,7 @@ def write_report(
         title: Heading of the picture and of the table.
         failed: Trials that are left out of the comparison; their curves are drawn as far as they got.
         baselines: Metrics of policies that are not trained, from `play_baselines`: rows of the markdown table.
+        last: How many evaluations at the end of each trial count; their mean is the trial's result.
 
     Returns:
         The comparison table as markdown, and what its numbers are.
@@ -247,11 +318,11 @@ def write_report(
     for path in results_dir.glob("*/result.json"):
         _rewrite_progress_csv(path)
     curves.to_csv(results_dir / "curves.csv", index=False)
-    plot_curves(curves, results_dir / "curves.png", title)
-    table = summarise(curves[~curves["trial"].isin(list(failed))])
+    plot_curves(curves, results_dir / "curves.png", title, baselines=baselines)
+    table = summarise(curves[~curves["trial"].isin(list(failed))], last)
     table.to_csv(results_dir / "comparison.csv")
     note = (
-        f"Noise-free evaluation: means over the last {LAST} evaluations of each trial, then over the seeds (score: ± "
+        f"Noise-free evaluation: means over the last {last} evaluations of each trial, then over the seeds (score: ± "
         f"their standard deviation). Time is h:mm:ss per trial."
     )
     if baselines:
@@ -259,5 +330,16 @@ def write_report(
     if failed:
         note += f" Failed and left out: {', '.join(failed)}."
     markdown = f"{to_markdown(table, baselines)}\n\n{note}"
-    (results_dir / "comparison.md").write_text(f"# {title}\n\n{markdown}\n")
+    (results_dir / "comparison.md").write_text(f"# {title}\n\n{markdown}\n\n![learning curves](curves.png)\n")
     return markdown
+
+
+def embed_film(results_dir: Path, trial: str) -> None:
+    """Show the film in comparison.md, below the curves.
+
+    Args:
+        results_dir: The folder that holds both.
+        trial: Whose film it is.
+    """
+    with (results_dir / "comparison.md").open("a") as file:
+        file.write(f"\n![an episode of {trial}]({FILM})\n")

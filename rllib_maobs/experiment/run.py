@@ -17,11 +17,13 @@ import ray
 from ray import tune
 
 import rllib_maobs as maobs
-from rllib_maobs.experiment.arguments import PAPER_HORIZON, has_started, make_parser, parse, save_settings
+from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
 from rllib_maobs.experiment.baselines import play_baselines
+from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
-from rllib_maobs.experiment.report import FILES, STEPS, write_report
+from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
 from rllib_maobs.experiment.resume import forget_decisions
+from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, settings_of_row
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
 
@@ -43,14 +45,41 @@ class Experiment:
     Every algorithm is trained with every seed. A trial evaluates its actors without exploration noise every 1000 env
     steps: 10 episodes of 100 steps on environments of its own. Its score is the paper's, the undiscounted return of
     the first agent. The results folder holds, beside the logs of Ray Tune (CSV, JSON, TensorBoard) and a checkpoint
-    for each trial: `comparison.md`, `comparison.csv`, `curves.csv`, `curves.png`.
+    for each trial: `comparison.md`, `comparison.csv`, `curves.csv`, `curves.png`, and `episode.gif`, an episode of the
+    best one.
+
+    A variant is a row of the comparison with settings of its own, which come before those of the experiment:
+
+        variants={
+            "maddpg-entity": {
+                "algorithm": "maddpg",
+                "actor": "entity",
+                "actor_lr": decayed(5e-4),
+                "env_config": {"action_mode": "force"},
+                "stop_timesteps": 200_000,
+                "quick": {"stop_timesteps": 60_000},
+            },
+        }
+
+    Beside `"algorithm"`, one of `maobs.ALGORITHMS`, and arguments of its `training()` it may have:
+
+    - `env_config`: options of the environment, in training and evaluation, beside the experiment's;
+    - `train_horizon`: steps of a training episode (100); evaluation episodes always have 100;
+    - `num_envs_per_env_runner`: copies of the environment (8);
+    - `one_policy`: whether all agents share one policy (False), which needs agents with equal spaces;
+    - `stop_timesteps`: the row's own env steps; `--stop-timesteps` on the command line holds for all rows;
+    - `steps_per_iteration`: env steps between evaluations (1000), and `evaluation_duration`: episodes of each (10);
+    - `torch_compile`: whether its update is compiled (True);
+    - `quick`: what `--quick` changes, a mapping of all but `"algorithm"`. It comes after what `--quick` changes for
+      every row: 4000 env steps, an evaluation of 5 episodes every 400, no compiling.
 
     Attributes:
         name: Names the default results folder.
         env: Registered name of the environment.
         algorithms: Names of the algorithms, or of variants.
-        variants: Algorithms with settings of their own, by the name they shall have in tables: `"algorithm"`, one of
-            `maobs.ALGORITHMS`, and arguments of its `training()`. A function there is called with a trial's env steps.
+        variants: Algorithms with settings of their own, by the name they shall have in tables. A function among the
+            arguments of `training()` is called with the trial's env steps, as `decayed` does it for learning rates.
+        quick_algorithms: Those of `algorithms` that `--quick` trains; none for all.
         training: Arguments of the configs' `training()`, the same for all algorithms.
         env_config: Options of the environment.
         stop_timesteps: Env steps of a trial.
@@ -63,11 +92,14 @@ class Experiment:
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     env_config: Mapping[str, Any] = field(default_factory=dict)
     stop_timesteps: int = 2_000_000
+    quick_algorithms: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        named = [self.variants.get(name, {"algorithm": name}).get("algorithm") for name in self.algorithms]
-        if unknown := [repr(name) for name in named if name not in maobs.ALGORITHMS]:
-            raise ValueError(f"Unknown algorithms {', '.join(unknown)}; legal are {', '.join(maobs.ALGORITHMS)}.")
+        for name in self.algorithms:
+            check_row(name, self.variants.get(name, {"algorithm": name}))
+        if unknown := [repr(name) for name in self.quick_algorithms if name not in self.algorithms]:
+            legal = ", ".join(self.algorithms)
+            raise ValueError(f"Unknown quick_algorithms {', '.join(unknown)}; legal are those of algorithms: {legal}.")
 
     def main(self, argv: Sequence[str] | None = None) -> None:
         """Run the command line.
@@ -78,8 +110,9 @@ class Experiment:
         Raises:
             SystemExit: With code 1 if a trial failed, 2 for wrong arguments, 130 if it was interrupted.
         """
-        parser = make_parser(self.name, self.algorithms, self.stop_timesteps, f"Train on {self.env}.")
-        args = parse(parser, self.name, argv)
+        doc = f"Train on {self.env}."
+        parser = make_parser(self.name, self.algorithms, self.stop_timesteps, doc, self.quick_algorithms)
+        args = parse(parser, self.name, argv, self.quick_algorithms)
         _quiet()
         specs = self.specs(args)
         try:
@@ -97,29 +130,32 @@ class Experiment:
 
     def specs(self, args: Namespace) -> list[TrialSpec]:
         """Return the trials, seed by seed, so that the first results compare all algorithms."""
+        return [self._spec(args, algorithm, seed) for seed in args.seeds for algorithm in args.algos]
 
-        def training(algorithm: str) -> dict[str, Any]:
-            own = {name: value for name, value in self.variants.get(algorithm, {}).items() if name != "algorithm"}
-            own = {name: value(args.stop_timesteps) if callable(value) else value for name, value in own.items()}
-            return {**self.training, "critic_state": args.critic_state, **own}
-
-        return [
-            TrialSpec(
-                algorithm=algorithm,
-                variant_of=self.variants.get(algorithm, {}).get("algorithm", ""),
-                seed=seed,
-                env=self.env,
-                training=training(algorithm),
-                env_config={**self.env_config, "horizon": args.train_horizon},
-                evaluation_env_config={"horizon": PAPER_HORIZON},
-                num_env_runners=args.num_env_runners,
-                torch_compile=not args.no_compile,
-                steps_per_iteration=400 if args.quick else 1000,
-                evaluation_duration=5 if args.quick else 10,
-            )
-            for seed in args.seeds
-            for algorithm in args.algos
-        ]
+    def _spec(self, args: Namespace, algorithm: str, seed: int) -> TrialSpec:
+        """Return one trial: what its row says, and what was given on the command line."""
+        row = self.variants.get(algorithm, {})
+        own = settings_of_row(row, self.stop_timesteps, quick=args.quick)
+        steps = args.stop_timesteps or own["stop_timesteps"]
+        training = {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
+        training = {key: value(steps) if callable(value) else value for key, value in training.items()}
+        horizon = args.train_horizon or own["train_horizon"]
+        return TrialSpec(
+            algorithm=algorithm,
+            variant_of=row.get("algorithm", ""),
+            seed=seed,
+            env=self.env,
+            stop_timesteps=steps,
+            training={**self.training, "critic_state": args.critic_state, **training},
+            env_config={**self.env_config, **own["env_config"], "horizon": horizon},
+            evaluation_env_config={"horizon": PAPER_HORIZON},
+            num_env_runners=args.num_env_runners,
+            num_envs_per_env_runner=own["num_envs_per_env_runner"],
+            one_policy=own["one_policy"],
+            torch_compile=own["torch_compile"] and not args.no_compile,
+            steps_per_iteration=own["steps_per_iteration"],
+            evaluation_duration=own["evaluation_duration"],
+        )
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
         """Measure, train, report; return the exit code."""
@@ -137,52 +173,83 @@ class Experiment:
             trials = tuner.fit()
         finally:
             ray.shutdown()
-        return self._report(args, trials, len(specs))
+        return self._report(args, trials, specs)
 
     def _print_plan(self, args: Namespace, specs: list[TrialSpec]) -> None:
         """Say what will be run, what it will take and where it will be found."""
-        config = specs[0].build_config()
+        rows = {spec.algorithm: spec for spec in specs[: len(args.algos)]}
+        print(f"{self.name}: {len(specs)} trials, {', '.join(rows)} with seed {', '.join(map(str, args.seeds))}")
+        left_out = [name for name in self.algorithms if name not in rows]
+        if args.quick and left_out and set(rows) == set(self.quick_algorithms):
+            print(
+                f"--quick trains {' and '.join(rows)} only: {', '.join(left_out)} need hours to show anything (name "
+                f"them with --algos, or leave --quick out)."
+            )
+        pace: dict[str, Pace] = {}
+        # A quick run of its own size takes minutes: to measure how many would compile everything once more.
+        if args.quick and args.stop_timesteps is None and len(args.seeds) == 1:
+            estimate = "Estimated: at most about five minutes on two free cores; in a quick run nothing is measured."
+        else:
+            pace, estimate = self._measured(args, specs)
+        header = ["algorithm", "env steps", "updates per env step"]
+        cells = [
+            [name, f"{spec.stop_timesteps:,}", f"{spec.build_config().updates_per_env_step:g}"]
+            for name, spec in rows.items()
+        ]
+        if pace:
+            header += ["env steps/s", "time per trial"]
+            for (name, spec), row in zip(rows.items(), cells, strict=True):
+                speed = pace[name].env_steps_per_s
+                row += [f"{speed:.0f}", format_time(spec.stop_timesteps / speed)]
         print(
-            f"{self.name}: {len(specs)} trials, {', '.join(args.algos)} with seed {', '.join(map(str, args.seeds))}\n"
-            f"{args.stop_timesteps:,} env steps each, {config.updates_per_env_step:g} update(s) per env step\n"
-            f"Measuring how fast that is here{'' if args.no_compile else ' (and compiling)'} ...",
-            flush=True,
-        )
-        start = time.monotonic()
-        cores = int(ray.available_resources().get("CPU", 0))
-        at_once = max(1, min(cores // (1 + args.num_env_runners), len(specs)))
-        pace = _measure(specs[: len(args.algos)], at_once, seconds=2.0 if args.quick else 10.0)
-        seconds = {name: args.stop_timesteps / pace[name].env_steps_per_s for name in args.algos}
-        rows = [[name, f"{pace[name].env_steps_per_s:.0f}", format_time(seconds[name])] for name in args.algos]
-        total = makespan([seconds[spec.algorithm] for spec in specs], at_once)
-        kept = min(args.stop_timesteps, config.replay_buffer_capacity)
-        megabytes = kept * max(each.bytes_per_env_step for each in pace.values()) / 1e6
-        print(
-            f"\n{format_table(['algorithm', 'env steps/s', 'time per trial'], rows)}\n\n"
-            f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
-            f"compiling.\n"
-            f"Estimated: {total / 3600:.2f} hours for all, {at_once} at once.\n"
-            f"Replay will take {megabytes:,.0f} MB of memory per trial, and as much of disk in its checkpoint; free "
-            f"disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB.\n"
+            f"\n{format_table(header, cells)}\n\n{estimate}\n"
             f"Results: {args.results_dir}\n"
             f"TensorBoard: tensorboard --logdir {shlex.quote(str(args.results_dir))}\n"
             f"Ctrl-C stops; then --resume goes on from the last checkpoints.\n",
             flush=True,
         )
 
-    def _report(self, args: Namespace, trials: tune.ResultGrid, planned: int) -> int:
-        """Write and print the results; return the exit code."""
+    def _measured(self, args: Namespace, specs: list[TrialSpec]) -> tuple[dict[str, Pace], str]:
+        """Measure the pace of each algorithm; return it, and what it says of the whole run."""
+        compiles = any(spec.torch_compile for spec in specs)
+        print(f"Measuring how fast that is here{' (and compiling)' if compiles else ''} ...", flush=True)
+        start = time.monotonic()
+        cores = int(ray.available_resources().get("CPU", 0))
+        at_once = max(1, min(cores // (1 + args.num_env_runners), len(specs)))
+        pace = _measure(specs[: len(args.algos)], at_once, seconds=2.0 if args.quick else 10.0)
+        total = makespan([spec.stop_timesteps / pace[spec.algorithm].env_steps_per_s for spec in specs], at_once)
+        megabytes = max(
+            min(spec.stop_timesteps, spec.build_config().replay_buffer_capacity)
+            * pace[spec.algorithm].bytes_per_env_step
+            / 1e6
+            for spec in specs[: len(args.algos)]
+        )
+        return pace, (
+            f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
+            f"compiling.\n"
+            f"Estimated: {total / 3600:.2f} hours for all, {at_once} at once.\n"
+            f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and as much of disk in its checkpoint; "
+            f"free disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB."
+        )
+
+    def _report(self, args: Namespace, trials: tune.ResultGrid, specs: list[TrialSpec]) -> int:
+        """Write and print the results, and film the best; return the exit code."""
         failed = [Path(trial.path) for trial in trials if trial.error]
+        names = [path.name for path in failed]
         try:
             baselines = play_baselines(self.env, {**self.env_config, "horizon": PAPER_HORIZON})
-            print(f"\n{write_report(args.results_dir, self.name, [path.name for path in failed], baselines)}\n")
-            print(f"In {args.results_dir}: {', '.join(FILES)}")
+            # A quick run has few evaluations, of which the first ones are from before it has learned anything.
+            last = LAST_QUICK if args.quick else LAST
+            print(f"\n{write_report(args.results_dir, self.name, names, baselines, last)}\n")
+            print(f"In {args.results_dir}: {', '.join(FILES)}", flush=True)
+            print(film_best(args.results_dir, specs, names, last))
         except FileNotFoundError as error:
             print(error)
         for path in failed:
             print(f"FAILED: {path.name}, see {path / 'error.txt'}")
-        finished = sum((trial.metrics or {}).get(STEPS, 0) >= args.stop_timesteps for trial in trials)
-        if finished + len(failed) < planned:
+        stops = {spec.name: spec.stop_timesteps for spec in specs}
+        finished = sum((trial.metrics or {}).get(STEPS, 0) >= stops[Path(trial.path).name] for trial in trials)
+        if finished + len(failed) < len(specs):
             print(f"Interrupted. Go on with: {_resume_command(args)}")
             return 130
         if failed:
@@ -229,11 +296,10 @@ def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tune
         run_config=tune.RunConfig(
             name=args.results_dir.name,
             storage_path=str(args.results_dir.parent),
-            stop={STEPS: args.stop_timesteps},
             checkpoint_config=tune.CheckpointConfig(
                 checkpoint_frequency=args.checkpoint_freq, checkpoint_at_end=True, num_to_keep=1
             ),
-            progress_reporter=ProgressTable(args.stop_timesteps, every_s=10.0 if args.quick else 30.0),
+            progress_reporter=ProgressTable(every_s=10.0 if args.quick else 30.0),
             verbose=1,
         ),
     )

@@ -11,7 +11,9 @@ from ray import tune
 from ray.rllib.algorithms import AlgorithmConfig
 
 import rllib_maobs as maobs
+from rllib_maobs.experiment.report import STEPS
 
+SHARED_POLICY = "all"
 # What Tune fills in by itself for the trial; the algorithm inside fills in its own, with a config of a thousand lines.
 _FILLED_BY_TUNE = {
     "config",
@@ -38,10 +40,13 @@ class TrialSpec:
         algorithm: Name of the algorithm, or of a variant of one: the trial's name in tables.
         seed: Of the environments, the exploration noise and the initial weights.
         env: Registered name of the environment.
+        stop_timesteps: Env steps after which the trial is done.
         training: Arguments of the config's `training()`.
         env_config: Options of the training environments.
         evaluation_env_config: Options of the evaluation environments where they differ.
         num_env_runners: Actors that sample beside the trial's own process; with 0 it samples itself.
+        num_envs_per_env_runner: Copies of the environment in each process that samples.
+        one_policy: Whether all agents share one policy, instead of one each.
         torch_compile: Whether the update runs under `torch.compile`.
         steps_per_iteration: Env steps between evaluations.
         evaluation_duration: Episodes per evaluation.
@@ -51,14 +56,27 @@ class TrialSpec:
     algorithm: str
     seed: int
     env: str
+    stop_timesteps: int
     training: dict[str, Any]
     env_config: dict[str, Any] = field(default_factory=dict)
     evaluation_env_config: dict[str, Any] = field(default_factory=dict)
     num_env_runners: int = 0
+    num_envs_per_env_runner: int = 8
+    one_policy: bool = False
     torch_compile: bool = True
     steps_per_iteration: int = 1000
     evaluation_duration: int = 10
     variant_of: str = ""
+
+    @property
+    def name(self) -> str:
+        """The trial's name, which is that of its folder, too."""
+        return f"{self.algorithm}-seed{self.seed}"
+
+    @property
+    def evaluation_options(self) -> dict[str, Any]:
+        """All options of the evaluation environments."""
+        return {**self.env_config, **self.evaluation_env_config}
 
     def build_config(self) -> AlgorithmConfig:
         """Return the algorithm's config.
@@ -67,17 +85,17 @@ class TrialSpec:
             The config; one iteration is `steps_per_iteration` env steps and an evaluation without exploration noise
             on environments of its own.
         """
-        return (
+        config = (
             maobs.ALGORITHMS[self.variant_of or self.algorithm]()
             .environment(self.env, env_config=self.env_config)
-            .env_runners(num_env_runners=self.num_env_runners, num_envs_per_env_runner=8)
+            .env_runners(num_env_runners=self.num_env_runners, num_envs_per_env_runner=self.num_envs_per_env_runner)
             .training(**self.training)
             .framework(torch_compile_learner=self.torch_compile)
             .evaluation(
                 evaluation_interval=1,
                 evaluation_duration=self.evaluation_duration,
                 evaluation_config=AlgorithmConfig.overrides(
-                    env_config=self.evaluation_env_config,
+                    env_config=self.evaluation_options,
                     explore=False,
                     num_envs_per_env_runner=self.evaluation_duration,
                 ),
@@ -85,6 +103,14 @@ class TrialSpec:
             .reporting(min_sample_timesteps_per_iteration=self.steps_per_iteration)
             .debugging(seed=self.seed)
         )
+        if self.one_policy:
+            config.multi_agent(policies={SHARED_POLICY}, policy_mapping_fn=one_policy)
+        return config
+
+
+def one_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
+    """RLlib's policy mapping where all agents share one policy."""
+    return SHARED_POLICY
 
 
 class Trial(tune.Trainable):
@@ -103,11 +129,14 @@ class Trial(tune.Trainable):
 
     def setup(self, config: dict[str, Any]) -> None:
         """Build the algorithm."""
-        self._algorithm = _build(TrialSpec(**config).build_config())
+        spec = TrialSpec(**config)
+        self._stop_timesteps = spec.stop_timesteps
+        self._algorithm = _build(spec.build_config())
 
     def step(self) -> dict[str, Any]:
-        """Train for one iteration."""
-        return {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
+        """Train for one iteration; the result says whether that was the last one."""
+        result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
+        return {**result, "done": result[STEPS] >= self._stop_timesteps}
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""

@@ -174,7 +174,7 @@ def main() -> None:
     cells = [
         (name, algorithm)
         for name in arguments.experiments
-        for algorithm in importlib.import_module(f"tuned_examples.{name}").experiment.algorithms
+        for algorithm in importlib.import_module(f"tuned_examples.{name}").[name for name in experiment.algorithms if name in maobs.ALGORITHMS]
         if not arguments.algos or algorithm in arguments.algos
     ]
     if not cells:

@@ -1,0 +1,44 @@
+"""The film at the end of a run: an episode of the best that was trained."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from rllib_maobs.envs import SCENARIOS, Recorder, parallel_env
+from rllib_maobs.experiment.report import FILM, LAST, best_trial, embed_film, load_curves
+from rllib_maobs.experiment.trial import TrialSpec
+from rllib_maobs.play import make_policy, play
+
+
+def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[str] = (), last: int = LAST) -> str:
+    """Film an episode of the best trial, as its last checkpoint plays it, and show it in comparison.md.
+
+    Args:
+        results_dir: The folder that the experiment wrote to.
+        specs: Its trials.
+        failed: Names of trials that do not count.
+        last: How many evaluations at the end of each trial count.
+
+    Returns:
+        A line that says where the film is, or why there is none; a film that fails is no reason to fail.
+    """
+    (results_dir / FILM).unlink(missing_ok=True)  # That of the run before it was resumed.
+    curves = load_curves(results_dir)
+    name = best_trial(curves[~curves["trial"].isin(list(failed))], last)
+    spec = next((spec for spec in specs if spec.name == name), None)
+    if spec is None:
+        return "No film: nothing has been evaluated."
+    scenario = spec.env.removeprefix("maobs/")
+    if scenario not in SCENARIOS:
+        return f"No film: {spec.env} is not an environment of this package."
+    checkpoint = max((results_dir / spec.name).glob("checkpoint_*"), default=None)
+    if checkpoint is None:
+        return f"No film: {spec.name}, the best one, has no checkpoint."
+    try:
+        recorder = Recorder(results_dir / FILM)
+        env = parallel_env(scenario, render_mode="rgb_array", **spec.evaluation_options)
+        play(env, make_policy(env, str(checkpoint)), recorder=recorder)
+        recorder.close()
+    except Exception as error:  # Whatever it is, the results are there, and matter more.
+        return f"No film: {str(error).partition(chr(10))[0] or type(error).__name__}"
+    embed_film(results_dir, spec.name)
+    return f"An episode of {spec.name}, the best one: {recorder.path}"
