@@ -10,7 +10,7 @@ compiling; the hours are those of the script's env steps at that pace.
 
 The columns: what `train()` makes in env steps/s, and the shares of its time (RLlib's is all that is left: metrics,
 weight sync, Python between updates); the update alone, beside the loop over agents in ordinary PyTorch
-(`tests/reference.py`, where it has the algorithm), in turns; and the machine's limit: the time that the update's matrix
+(`tests/benchmarks/loop.py`, where it has the algorithm), in turns; and the machine's limit: the time that the update's matrix
 products take by themselves, each measured on its very shape, and the bytes of parameters, targets and Adam's state over
 the bandwidth measured on vectors of that size. The last but one column is `train()` as a share of that limit.
 """

@@ -7,8 +7,8 @@ import torch
 
 import rllib_maobs as maobs
 from rllib_maobs.replay import Batch
+from tests.benchmarks.loop import LoopLearner
 from tests.benchmarks.measure import Stopwatch, Work
-from tests.reference import LoopLearner
 
 # What the loop over agents can learn.
 LOOPS = ("iddpg", "maddpg", "maddpg-l")
