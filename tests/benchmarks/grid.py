@@ -10,9 +10,10 @@ compiling; the hours are those of the script's env steps at that pace.
 
 The columns: what `train()` makes in env steps/s, and the shares of its time (RLlib's is all that is left: metrics,
 weight sync, Python between updates); the update alone, beside the loop over agents in ordinary PyTorch
-(`tests/benchmarks/loop.py`, where it has the algorithm), in turns; and the machine's limit: the time that the update's matrix
-products take by themselves, each measured on its very shape, and the bytes of parameters, targets and Adam's state over
-the bandwidth measured on vectors of that size. The last but one column is `train()` as a share of that limit.
+(`tests/benchmarks/loop.py`, where it has the algorithm), in turns; and the machine's limit: the time that the update's
+matrix products take by themselves, each measured on its very shape, and the bytes of parameters, targets and Adam's
+state over the bandwidth measured on vectors of that size. The last but one column is `train()` as a share of that
+limit.
 """
 
 import argparse
@@ -174,7 +175,8 @@ def main() -> None:
     cells = [
         (name, algorithm)
         for name in arguments.experiments
-        for algorithm in importlib.import_module(f"tuned_examples.{name}").[name for name in experiment.algorithms if name in maobs.ALGORITHMS]
+        for algorithm in importlib.import_module(f"tuned_examples.{name}").experiment.algorithms
+        if algorithm in maobs.ALGORITHMS  # the paper's rows
         if not arguments.algos or algorithm in arguments.algos
     ]
     if not cells:

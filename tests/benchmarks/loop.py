@@ -1,6 +1,6 @@
 """Plain DDPG-family learning, written from the equations as a loop over agents in ordinary PyTorch.
 
-It is the oracle for losses and gradients and the baseline for speed, so it shares no code with the package:
+It is the baseline for speed, so it shares no code with the package:
 every agent has its own networks and its own two Adam optimisers, and nothing is stacked.
 """
 
@@ -11,11 +11,6 @@ from torch import Tensor, nn
 
 Sample = dict[str, Tensor]
 """obs, next_obs (B, N, O); state, next_state (B, S); actions (B, N, A); rewards (B, N); terminated (B, 1)."""
-
-
-def whole_layers(critic: list[Tensor]) -> list[Tensor]:
-    """A critic of the package, parameter by parameter: it keeps the first weight in two parts, state and action."""
-    return [torch.cat(critic[:2], dim=1), *critic[2:]]
 
 
 def network(inputs: int, outputs: int, hidden: tuple[int, ...], last: nn.Module) -> nn.Sequential:
@@ -56,18 +51,6 @@ class LoopLearner:
         self.target_actors, self.target_critics = copy.deepcopy(self.actors), copy.deepcopy(self.critics)
         self.actor_optimizers = [torch.optim.Adam(net.parameters(), lr=actor_lr) for net in self.actors]
         self.critic_optimizers = [torch.optim.Adam(net.parameters(), lr=critic_lr) for net in self.critics]
-
-    def copy_from(self, modules: list[nn.Module]) -> None:
-        """Takes over the parameters of the package's modules, one per agent, layer by layer."""
-        for a, module in zip(self.agents, modules, strict=True):
-            for own, theirs in (
-                (self.actors[a], list(module.actor.parameters())),
-                (self.critics[a], whole_layers(list(module.critic.parameters()))),
-                (self.target_actors[a], list(module.target_actor.parameters())),
-                (self.target_critics[a], whole_layers(list(module.target_critic.parameters()))),
-            ):
-                for p, q in zip(own.parameters(), theirs, strict=True):
-                    p.data.copy_(q.data)
 
     def critic_input(self, a: int, obs: Tensor, state: Tensor, actions: list[Tensor]) -> Tensor:
         if self.algorithm == "iddpg":
