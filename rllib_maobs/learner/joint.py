@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -22,9 +21,10 @@ from ray.rllib.utils.metrics import (
 from torch import Tensor
 from torch.func import grad_and_value
 
+from rllib_maobs.learner.compare import compare_networks
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
 from rllib_maobs.learner.update import StackedAdam, clipped, compiled, denormals_are_zero
-from rllib_maobs.modules import Actor, Params, RecurrentActor, Stack
+from rllib_maobs.modules import Params, Stack
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
 from rllib_maobs.replay import Batch, Moment
@@ -285,77 +285,8 @@ class JointLearner(TorchLearner):
         draws: dict[str | None, Callable[..., Tensor]] = {"normal": torch.randn, "uniform": torch.rand}
         self._draw = draws.get(kind)
         self._generator = torch.Generator().manual_seed(config.seed or 0)
-        self._try_networks()
-
-    @torch.no_grad()
-    def _try_networks(self) -> None:
-        """Compares what the stacks compute with every agent's own network, once, on random inputs.
-
-        Raises:
-            ValueError: If a network fails, if its result has another shape than it must have, or if called for all
-                agents at once it computes something else than by itself; names it.
-        """
-        team, rows, generator = self.config.team, 3, torch.Generator().manual_seed(0)
-        agents, length = len(team.agents), self.config.window_length
-
-        def drawn(*shape: int) -> Tensor:
-            return torch.randn(shape, generator=generator).to(self._device)
-
-        obs, actions = drawn(rows, agents, team.observation_size), drawn(rows, agents, team.action_size)
-        window = drawn(rows, agents, length, team.observation_size) if length else None
-        mask = torch.ones(rows, length, device=self._device) if length else None
-        state = drawn(rows, self.config.state_size) if self.config.uses_state else None
-        moment = Moment(obs if window is None else window[:, :, -1], state, window, mask)
         for parts, stacks in ((self.parts, self._roles), (self.target_parts, self._targets)):
-            nets = TeamNetworks(parts, self._params_of(stacks))
-            self._compare(parts.actors, partial(nets.outputs, moment), team.action_size, moment, actions)
-            if parts.critics is not None:
-                width = 1 + self.config.twin_critics
-                self._compare(parts.critics, partial(nets.q, moment, actions), width, moment, actions)
-
-    def _compare(
-        self, stack: Actors | Critics, call: Callable[[], Tensor], width: int, moment: Moment, actions: Tensor
-    ) -> None:
-        """Compares a stack's result, `(B, N, width)`, with that of each agent's own network."""
-        rows, agents = actions.shape[:2]
-        for agent, (network, name) in enumerate(zip(stack.networks, stack.names, strict=True)):
-            what = f"{name} ({type(network).__name__})"
-            try:
-                alone = self._alone(network, agent, moment, actions)
-                together = call()
-            except Exception as error:
-                raise ValueError(f"{what} can't be called for all agents at once by vmap: {error}") from error
-            if together.shape != (rows, agents, width):
-                raise ValueError(
-                    f"{what} must return {width} numbers in a last dimension; for {agents} agents and a batch of "
-                    f"{rows} that is {(rows, agents, width)}, not {tuple(together.shape)}."
-                )
-            if not torch.isfinite(alone).all():
-                raise ValueError(f"{what} returns numbers that are not finite for ordinary inputs.")
-            own = together[:, agent, : alone.shape[-1]]
-            if not torch.allclose(own, alone, rtol=1e-3, atol=1e-4):
-                raise ValueError(
-                    f"{what} called for all agents at once computes something else than by itself (by up to "
-                    f"{(own - alone).abs().max():.2g}): is there anything in it but parameters, layers and settings?"
-                )
-
-    def _alone(self, network: Any, agent: int, moment: Moment, actions: Tensor) -> Tensor:
-        """What one agent's network computes by itself."""
-        team, config = self.config.team, self.config
-        if isinstance(network, Actor):
-            size = team.observation_sizes[agent]
-            if not isinstance(network, RecurrentActor):
-                return network(moment.obs[:, agent, :size])
-            assert moment.window is not None
-            return RecurrentActor.unroll(network, moment.window[:, agent, :, :size], moment.mask)[0]
-        local = not config.central_critic
-        state = moment.obs[:, agent, : team.observation_sizes[agent]] if local else moment.state
-        action = actions[:, agent, : team.action_sizes[agent]] if local else actions[:, agent]
-        if "joint_action" in config.critic_sees:
-            action = actions.flatten(1)
-        ids = self.parts.agent_ids
-        result: Tensor = network(state, action) if ids is None else network(state, action, ids[agent])
-        return result
+            compare_networks(TeamNetworks(parts, self._params_of(stacks)), self._device)
 
     def stacks(
         self,
