@@ -61,7 +61,7 @@ def test_updates_per_env_step_is_exact_over_time(ray_session: None, copies: int,
     config.reporting(min_sample_timesteps_per_iteration=1)
     algo = config.build_algo()
     steps = 0
-    while steps < 1100:
+    while steps < 500:
         steps = int(algo.train()["num_env_steps_sampled_lifetime"])
         assert algo._progress["updates"] == max(0, math.floor(ratio * (steps - 100)))
     assert updates_of(algo) == math.floor(ratio * (steps - 100))

@@ -282,7 +282,7 @@ def test_compiled_equals_eager_over_many_updates(make_learner: MakeLearner, case
     for stacks, others in ((compiled._roles, eager._roles), (compiled._targets, eager._targets)):
         for role, stack in stacks.items():
             stack.flat.data.copy_(others[role].flat.data)
-    for seed in range(100):
+    for seed in range(100 if backend == "inductor" else 40):
         batch = random_batch(eager.config, seed=seed)
         if seed == 0 and eager.normalizers is not None:
             for learner in (eager, compiled):
