@@ -143,7 +143,7 @@ class JointLearner(TorchLearner):
             if not self._with_actors:
                 return losses.sum(), (losses, q)
             outputs = TeamNetworks(self.parts, params).outputs(batch.now)
-            constant = TeamNetworks(self.parts, online, constant=tracked)
+            constant = TeamNetworks(self.parts, online, encoded_by=tracked)
             actor_losses = self.actor_loss(constant.actions(outputs, batch.noise), constant, batch)
             self._check_losses("actor_loss", actor_losses)
             regularization = self.config.action_regularization * outputs.square().mean((0, 2)).sum()

@@ -44,23 +44,24 @@ class Parts:
 
 
 class TeamNetworks:
-    """All agents' networks with one set of parameters: online, target, or online with constants for some roles.
+    """All agents' networks with one set of parameters, e.g. the online or the target ones.
 
     Everything is computed for all agents at once; agent i's part of a result is at `[:, i]`.
 
     Args:
         parts: The networks, and the team's constants.
         params: Parameters by role ("actor", "critic", "mixer").
-        constant: Networks with the same critics, whose encoded states these take over without a gradient.
+        encoded_by: Networks with the same critics. What those have encoded is not computed again, and is a constant
+            here.
     """
 
-    def __init__(self, parts: Parts, params: Mapping[str, Params], constant: TeamNetworks | None = None) -> None:
+    def __init__(self, parts: Parts, params: Mapping[str, Params], encoded_by: TeamNetworks | None = None) -> None:
         self.parts, self.params = parts, params
         self.config = parts.config
         # What the critics saw of states, and their share of it.
         self._encoded: list[tuple[Input, Input]] = []
-        if constant is not None:
-            for state, encoded in constant._encoded:
+        if encoded_by is not None:
+            for state, encoded in encoded_by._encoded:
                 self._encoded.append((state, encoded._replace(tensor=encoded.tensor.detach())))
 
     def outputs(self, moment: Moment) -> Tensor:
