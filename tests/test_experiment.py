@@ -482,7 +482,7 @@ def test_the_plan_of_a_quick_run_measures_nothing(capsys: pytest.CaptureFixture[
         ({}, "Row 'a': unknown algorithm ''; legal are iddpg"),
         (
             {"algorithm": "maddpg", "actr_lr": 1.0},
-            r"Row 'a' has no setting 'actr_lr' \(did you mean 'actor_lr'\?\); legal are env_config, train_horizon, "
+            r"Row 'a' has no setting 'actr_lr' \(did you mean 'actor_lr'\?\); legal are env_config, train_env_config, "
             r".*, quick, and arguments of training\(\): other_agents_actions, actor_lr, .*gamma",
         ),
         ({"algorithm": "iddpg", "other_agents_actions": "joint"}, "has no setting 'other_agents_actions'"),
@@ -494,6 +494,10 @@ def test_the_plan_of_a_quick_run_measures_nothing(capsys: pytest.CaptureFixture[
         ({"algorithm": "maddpg", "lr": 1e-3}, "Row 'a' has no setting 'lr'"),
         ({"algorithm": "maddpg", "quick": {"quick": {}}}, "Row 'a', quick has no setting 'quick'"),
         ({"algorithm": "maddpg", "quick": True}, "quick=True is illegal; legal: a mapping of settings"),
+        (
+            {"algorithm": "maddpg", "train_env_config": 3},
+            "Row 'a': train_env_config=3 is illegal; legal: a mapping of the environment's options",
+        ),
     ],
 )
 def test_rows_with_unknown_settings_are_refused(row: dict[str, Any], message: str) -> None:
@@ -595,6 +599,29 @@ def test_scripts_have_a_row_that_learns_in_minutes(script: str, agents: int) -> 
     small = row["quick"]["stop_timesteps"]
     assert small < steps / 3
     assert [trial_settings(spec) for spec in quick] == [(small, 4000, 20, True), (4000, 400, 5, False)]
+
+
+def test_what_training_changes_of_the_environment_evaluation_does_not_see(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    row: dict[str, Any] = {"algorithm": "maddpg", "env_config": {"agent_collision_penalty": 2.0}}
+    row["train_env_config"] = {"agent_collision_penalty": 5.0, "obstacle_collision_penalty": 4.0}
+    experiment = replace(EXPERIMENT, algorithms=("a",), variants={"a": row})
+    (spec,) = experiment.specs(parsed(experiment, "--seeds", "0"))
+    prices = ["agent_collision_penalty", "obstacle_collision_penalty"]
+    assert [spec.env_config[price] for price in prices] == [5.0, 4.0]
+    evaluation = spec.build_config().get_evaluation_config_object()
+    assert [evaluation.env_config[price] for price in prices] == [2.0, 1.0]  # the row's, and the scenario's default
+
+    def refused(experiment: Experiment) -> str:
+        with pytest.raises(SystemExit):
+            experiment.main(["--results-dir", str(tmp_path / "a")])
+        return capsys.readouterr().err
+
+    foreign = replace(experiment, env="theirs")
+    assert "train_env_config changes obstacle_collision_penalty of theirs: give what evaluation" in refused(foreign)
+    wrong = {**row, "train_env_config": {"agent_colision_penalty": 5.0}}
+    assert "did you mean 'agent_collision_penalty'" in refused(replace(experiment, variants={"a": wrong}))
 
 
 def test_variants_have_settings_that_depend_on_the_env_steps() -> None:

@@ -23,7 +23,7 @@ from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
 from rllib_maobs.experiment.resume import forget_decisions
-from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, settings_of_row
+from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
 
@@ -64,6 +64,8 @@ class Experiment:
     Beside `"algorithm"`, one of `maobs.ALGORITHMS`, and arguments of its `training()` it may have:
 
     - `env_config`: options of the environment, in training and evaluation, beside the experiment's;
+    - `train_env_config`: options that only training has, such as a higher price of contacts; what is reported is what
+      the evaluation's own reward says;
     - `train_horizon`: steps of a training episode (100); evaluation episodes always have 100;
     - `num_envs_per_env_runner`: copies of the environment (8);
     - `one_policy`: whether all agents share one policy (False), which needs agents with equal spaces;
@@ -114,8 +116,8 @@ class Experiment:
         parser = make_parser(self.name, self.algorithms, self.stop_timesteps, doc, self.quick_algorithms)
         args = parse(parser, self.name, argv, self.quick_algorithms)
         _quiet()
-        specs = self.specs(args)
         try:
+            specs = self.specs(args)
             for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
                 spec.build_config().validate()
         except ValueError as error:
@@ -140,6 +142,7 @@ class Experiment:
         training = {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
         training = {key: value(steps) if callable(value) else value for key, value in training.items()}
         horizon = args.train_horizon or own["train_horizon"]
+        env_config = {**self.env_config, **own["env_config"]}
         return TrialSpec(
             algorithm=algorithm,
             variant_of=row.get("algorithm", ""),
@@ -147,8 +150,11 @@ class Experiment:
             env=self.env,
             stop_timesteps=steps,
             training={**self.training, "critic_state": args.critic_state, **training},
-            env_config={**self.env_config, **own["env_config"], "horizon": horizon},
-            evaluation_env_config={"horizon": PAPER_HORIZON},
+            env_config={**env_config, **own["train_env_config"], "horizon": horizon},
+            evaluation_env_config={
+                **options_before(self.env, env_config, own["train_env_config"]),
+                "horizon": PAPER_HORIZON,
+            },
             num_env_runners=args.num_env_runners,
             num_envs_per_env_runner=own["num_envs_per_env_runner"],
             one_policy=own["one_policy"],
