@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import torch
+from ray.rllib.core.rl_module import RLModule
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.policy.policy import PolicySpec
 
@@ -206,12 +207,16 @@ def check_layouts(config: JointConfig) -> None:
     """Builds every policy's networks once, so that one which can't do with its layout is an error now."""
     if config.mixes and config.mixer_settings() is None:
         raise ValueError(f"{config.name} mixes values (mixes=True), but its mixer_settings() says not how.")
+    built_modules(config)
+
+
+def built_modules(config: JointConfig) -> dict[str, RLModule]:
+    """The modules that a learner would start with, by policy."""
     team = config.team
     spaces = {mid: team.spaces(agent) for agent, mid in zip(team.agents, config.module_ids, strict=True)}
     specs = config.get_multi_rl_module_spec(spaces=spaces).rl_module_specs
     with torch.random.fork_rng(devices=[]):  # the run's own networks start as if there had been no check
-        for spec in specs.values():
-            spec.build()
+        return {mid: spec.build() for mid, spec in specs.items()}
 
 
 def agent_groups(config: JointConfig, state: Layout) -> list[tuple[str, int]]:

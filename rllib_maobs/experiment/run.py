@@ -17,6 +17,7 @@ import ray
 from ray import tune
 
 import rllib_maobs as maobs
+from rllib_maobs.checkpoints import saved_networks
 from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.film import film_best
@@ -119,7 +120,10 @@ class Experiment:
         try:
             specs = self.specs(args)
             for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
-                spec.build_config().validate()
+                config = spec.build_config()
+                config.validate()
+                if spec.start_from and not args.resume:
+                    saved_networks(config, spec.start_from)
         except ValueError as error:
             parser.error(str(error))
         try:
@@ -161,6 +165,7 @@ class Experiment:
             torch_compile=own["torch_compile"] and not args.no_compile,
             steps_per_iteration=own["steps_per_iteration"],
             evaluation_duration=own["evaluation_duration"],
+            start_from=args.start_from,
         )
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
