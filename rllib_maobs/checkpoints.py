@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,13 @@ def find_checkpoint(path: str | Path) -> Path:
 def module_folders(checkpoint: Path) -> dict[str, Path]:
     """Return the folder of each module in a checkpoint, by id."""
     return {path.name: path for path in sorted(checkpoint.joinpath(*_MODULES).iterdir()) if path.is_dir()}
+
+
+def saved_config(checkpoint: Path) -> Mapping[str, Any]:
+    """Return the settings of a checkpoint's algorithm, by name."""
+    stored: Any = pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())
+    config: Mapping[str, Any] = stored["ctor_args_and_kwargs"][0][0]
+    return config
 
 
 def saved_networks(config: JointConfig, checkpoint: str | Path) -> dict[str, dict[str, Any]]:
