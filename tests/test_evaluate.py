@@ -113,7 +113,7 @@ def test_resized_tasks() -> None:
     [
         (["--episodes", 1], "--episodes 1 is illegal; legal: an integer >= 2"),
         (["--num-agents", 0], "--num-agents 0 is illegal; legal: integers >= 1"),
-        (["agent_range=0.2", "--num-agents", 12], "do not fit"),
+        (["agent_range=0.2", "--num-agents", 12], "use fewer or smaller bodies"),
         (["horzon=3"], "did you mean 'horizon'"),
         (["--env", "spread-4a"], "unknown scenario 'spread-4a'"),
         (["--env", "obstacle-predator-prey"], "was trained on"),

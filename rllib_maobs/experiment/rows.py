@@ -62,6 +62,27 @@ def decayed(rate: float) -> Callable[[int], list[list[float]]]:
     return schedule
 
 
+def fading(epsilon: float, noise: float, final: float) -> Callable[[int], dict[str, float]]:
+    """Return exploration for a row's settings that falls evenly over the first 60 % of a trial, to `final`.
+
+        "exploration": fading(epsilon=0.1, noise=0.2, final=0.02)
+
+    Args:
+        epsilon: Share of random actions at the start.
+        noise: Standard deviation of the Gaussian noise at the start.
+        final: Where both stop.
+
+    Returns:
+        A function from a trial's env steps to settings of `EpsilonGaussian`.
+    """
+
+    def settings(env_steps: int) -> dict[str, float]:
+        decay = (max(epsilon, noise) - final) / (0.6 * env_steps)
+        return {"epsilon": epsilon, "noise": noise, "decay": decay, "final": final}
+
+    return settings
+
+
 def check_row(name: str, row: Mapping[str, Any]) -> None:
     """Check the names of a row's settings, and the values of those that are the trial's.
 
