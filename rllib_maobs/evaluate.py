@@ -151,9 +151,9 @@ def jobs_of(
         make_scenario(task.env, **{**task.options, **scenario.resized(size), **options}) for size in sizes
     ] or [scenario]
     for each in scenarios:
-        env = VectorEnv(each)
-        env.reset(seed=seed)  # whether everything fits into the room
-        make_policy(env, checkpoint, seed)
+        vec = VectorEnv(each)
+        vec.reset(seed=seed)  # whether everything fits into the room
+        make_policy(vec, checkpoint, seed)
     return [(checkpoint, Task(task.env, asdict(each.options))) for each in scenarios]
 
 
@@ -216,6 +216,7 @@ def to_text(table: pd.DataFrame) -> str:
 
 def _evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame:
     """Play all episodes of one policy on one task, so many copies at once as are quick."""
+    print(f"{task.env}, {task.num_agents} agents: {policy} ...", file=sys.stderr, flush=True)
     rows, done = [], 0
     while done < episodes:
         env = make_vec(task.env, num_envs=min(_AT_ONCE, episodes - done), **task.options)
