@@ -26,7 +26,7 @@ from ray.rllib.algorithms import Algorithm
 
 import rllib_maobs as maobs
 from rllib_maobs.envs import make_vec
-from rllib_maobs.experiment import Experiment, decayed, load_curves, plot_curves, summarise
+from rllib_maobs.experiment import Experiment, decayed, fading, load_curves, plot_curves, summarise
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.film import film_best
@@ -592,13 +592,25 @@ def test_scripts_have_a_row_that_learns_in_minutes(script: str, agents: int) -> 
     assert (config.name, config.actor, config.critic, config.critic_state) == ("maddpg", "entity", "entity", "world")
     assert config.module_ids == ("all",) * agents
     assert config.critic_lr == [[0, 1e-3], [steps // 2, 1e-3], [steps, 5e-5]]
-    assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"]}
-    assert tuned.evaluation_options == {"action_mode": "force", "horizon": 100}
+    stricter = row.get("train_env_config", {})
+    assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"], **stricter}
+    scenario = maobs.make_vec(tuned.env.removeprefix("maobs/")).scenario
+    usual = {name: getattr(scenario.options, name) for name in stricter}
+    assert tuned.evaluation_options == {"action_mode": "force", "horizon": 100, **usual}
     quick = experiment.specs(parsed(experiment, "--quick"))
     assert [spec.name for spec in quick] == ["maddpg-entity-seed0", "maddpg-seed0"]
     small = row["quick"]["stop_timesteps"]
     assert small < steps / 3
     assert [trial_settings(spec) for spec in quick] == [(small, 4000, 20, True), (4000, 400, 5, False)]
+
+
+def test_settings_of_the_experiment_may_depend_on_the_env_steps_and_be_classes() -> None:
+    training = {"actor_lr": decayed(1e-3), "exploration": fading(epsilon=0.1, noise=0.2, final=0.02)}
+    experiment = replace(EXPERIMENT, training={**training, "actor": maobs.MLPActor})
+    spec = experiment.specs(parsed(experiment, "--stop-timesteps", "1000"))[0]
+    assert spec.training["actor_lr"] == [[0, 1e-3], [500, 1e-3], [1000, 5e-5]]
+    assert spec.training["exploration"] == {"epsilon": 0.1, "noise": 0.2, "decay": pytest.approx(3e-4), "final": 0.02}
+    assert spec.training["actor"] is maobs.MLPActor
 
 
 def test_what_training_changes_of_the_environment_evaluation_does_not_see(

@@ -80,10 +80,10 @@ class Experiment:
         name: Names the default results folder.
         env: Registered name of the environment.
         algorithms: Names of the algorithms, or of variants.
-        variants: Algorithms with settings of their own, by the name they shall have in tables. A function among the
-            arguments of `training()` is called with the trial's env steps, as `decayed` does it for learning rates.
+        variants: Algorithms with settings of their own, by the name they shall have in tables.
         quick_algorithms: Those of `algorithms` that `--quick` trains; none for all.
-        training: Arguments of the configs' `training()`, the same for all algorithms.
+        training: Arguments of the configs' `training()`, the same for all algorithms. A function among them, or among
+            those of a variant, is called with the trial's env steps, see `decayed` and `fading`.
         env_config: Options of the environment.
         stop_timesteps: Env steps of a trial.
     """
@@ -143,8 +143,11 @@ class Experiment:
         row = self.variants.get(algorithm, {})
         own = settings_of_row(row, self.stop_timesteps, quick=args.quick)
         steps = args.stop_timesteps or own["stop_timesteps"]
-        training = {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
-        training = {key: value(steps) if callable(value) else value for key, value in training.items()}
+        training = {**self.training, "critic_state": args.critic_state}
+        training |= {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
+        # A class is a setting, too: of a network, say.
+        depends = {key for key, value in training.items() if callable(value) and not isinstance(value, type)}
+        training = {key: value(steps) if key in depends else value for key, value in training.items()}
         horizon = args.train_horizon or own["train_horizon"]
         env_config = {**self.env_config, **own["env_config"]}
         return TrialSpec(
@@ -153,7 +156,7 @@ class Experiment:
             seed=seed,
             env=self.env,
             stop_timesteps=steps,
-            training={**self.training, "critic_state": args.critic_state, **training},
+            training=training,
             env_config={**env_config, **own["train_env_config"], "horizon": horizon},
             evaluation_env_config={
                 **options_before(self.env, env_config, own["train_env_config"]),
