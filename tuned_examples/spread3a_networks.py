@@ -4,7 +4,7 @@
     python tuned_examples/spread3a_networks.py --quick   # MADDPG with each of the networks, one seed
     python tuned_examples/spread3a_networks.py --help
 
-Not in the paper. All rows have the same budget, and the settings of the row "maddpg-entity" of `spread3a.py`: one policy
+Not in the paper. All rows have one budget, and the settings of the row "maddpg-entity" of `spread3a.py`: one policy
 for all agents, short training episodes, 32 copies, one update for eight env steps.
 """
 

@@ -116,7 +116,6 @@ def make_parser(
         dest="start_from",
         metavar="CHECKPOINT",
         type=_absolute,
-        default="",
         help="start from the networks of another run, such as a trial's folder of a smaller team; all rows must have "
         "networks of the same kind",
     )

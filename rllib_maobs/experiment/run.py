@@ -168,7 +168,7 @@ class Experiment:
             torch_compile=own["torch_compile"] and not args.no_compile,
             steps_per_iteration=own["steps_per_iteration"],
             evaluation_duration=own["evaluation_duration"],
-            start_from=args.start_from,
+            start_from=args.start_from or "",
         )
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
