@@ -28,7 +28,7 @@ NonNegative = Annotated[float, Range(0.0)]
 
 @dataclass(frozen=True)
 class Supports:
-    """What an algorithm is defined for; validation, the README's table and the tests follow it.
+    """What an algorithm is defined for; validation, the docs' table and the tests follow it.
 
     Attributes:
         actions: Kinds of action spaces, of "continuous" and "discrete".
