@@ -73,16 +73,21 @@ def network_settings(
     Raises:
         ValueError: For one that it does not take; names the legal ones.
     """
-    takes = settings_of(cls, reserved)
-    anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values())
     common = {
         own: model_config[name]
         for name, own in COMMON_SETTINGS.items()
-        if name in model_config and (own in takes or (anything and own == name))
+        if name in model_config and takes(cls, name, reserved)
     }
     settings = copy.deepcopy({**common, **own})  # each network has its own
     check_settings(cls, settings, reserved)
     return settings
+
+
+def takes(cls: type[Any], name: str, reserved: Collection[str] = ()) -> bool:
+    """Whether a network takes a setting of RLlib's `model_config`."""
+    own, parameters = COMMON_SETTINGS[name], settings_of(cls, reserved)
+    anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return own in parameters or (anything and own == name)
 
 
 class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
