@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Collection
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import torch
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import ALL_MODULES
 from ray.rllib.core.rl_module import validate_module_id
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
@@ -257,6 +262,28 @@ def check_layouts(config: JointConfig) -> None:
     with torch.random.fork_rng(devices=[]):  # the run's own networks start as if there had been no check
         for spec in specs.values():
             spec.build()
+
+
+def check_machine(config: AlgorithmConfig) -> None:
+    """Checks that the machine of the learner has what the configuration asks for; the others need not."""
+    if config.num_gpus_per_learner > 0 and not torch.cuda.is_available():
+        raise ValueError(
+            f"num_gpus_per_learner must be 0 where PyTorch finds no GPU, not {config.num_gpus_per_learner}: "
+            f"torch.cuda.is_available() is False."
+        )
+    if config.torch_compile_learner and config.torch_compile_learner_dynamo_backend == "inductor":
+        check_compiler()
+
+
+def check_compiler() -> None:
+    """Checks that there is the C++ compiler that `torch.compile` calls."""
+    given = os.environ.get("CXX") or {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++")
+    if shutil.which(shlex.split(given)[0]) is None:
+        raise ValueError(
+            f"Compiled updates need a C++ compiler, and there is no {given!r} on the PATH: install one (apt install "
+            f"g++, or conda install gxx), or go without by framework(torch_compile_learner=False), which is "
+            f"--no-compile of the example scripts: the same numbers, several times slower."
+        )
 
 
 def agent_groups(config: JointConfig, state: Layout) -> list[tuple[str, int]]:
