@@ -6,9 +6,10 @@
 
 Without `--record` the episodes run in a window, in real time. At the end the mean metrics are printed. CHECKPOINT is
 the folder of an RLlib algorithm checkpoint, of this package or of a stock algorithm trained on `MAObsEnv`; its
-policies act without exploration. Agents with entity networks that share a policy play teams of any size:
+policies act without exploration. They play what they were evaluated on: the options in the checkpoint hold unless the
+command line says otherwise. Agents with entity networks that share a policy play teams of any size:
 
-    python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a action_mode=force
+    python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a
 """
 
 import argparse
@@ -27,6 +28,7 @@ from rllib_maobs.layout import Layout
 
 Policy = Callable[[Mapping[str, NDArray[np.float32]]], dict[str, Any]]
 _MODULES = ("learner_group", "learner", "rl_module")
+_ARGUMENTS = "class_and_ctor_args.pkl"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -50,12 +52,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--episodes {args.episodes} is illegal; legal: an integer >= 1")
     try:
         mode = "rgb_array" if args.record else None if args.no_window else "human"
-        env = parallel_env(args.env, render_mode=mode, **parse_options(args.options))
+        options = parse_options(args.options)
+        saved = {name: value for name, value in saved_options(args.policy, args.env).items() if name not in options}
+        env = parallel_env(args.env, render_mode=mode, **saved, **options)
         policy = make_policy(env, args.policy, args.seed)
         recorder = Recorder(args.record) if args.record else None
     except (ValueError, ImportError) as error:
         parser.error(str(error))
     metrics = play(env, policy, args.episodes, args.seed, recorder)
+    if saved:
+        print(f"options of the checkpoint: {' '.join(f'{name}={value}' for name, value in saved.items())}")
     print(f"{args.env}, {args.policy}: mean over {args.episodes} episodes from seed {args.seed}")
     for name, value in metrics.items():
         print(f"  {name:24} {value:10.3f}")
@@ -217,9 +223,36 @@ class CheckpointPolicy:
         return unsquash_action(flat, space) if space.shape else int(flat)
 
 
+def saved_options(policy: str, scenario_id: str) -> dict[str, Any]:
+    """Return the environment options of a checkpoint, those of its evaluation where they differ from the training's.
+
+    Args:
+        policy: Folder of an algorithm checkpoint; anything else has no options.
+        scenario_id: What is to be played. If that is not what was trained, its own preset options come first, such as
+            the number of agents of spread-9a.
+    """
+    checkpoint = Path(policy)
+    if scenario_id not in SCENARIOS or not (checkpoint / _ARGUMENTS).is_file():
+        return {}
+    config = _saved_config(checkpoint)
+    evaluation = config.get("evaluation_config") or {}
+    saved = {**(config.get("env_config") or {}), **(evaluation.get("env_config") or {})}
+    cls, preset = SCENARIOS[scenario_id]
+    env = str(config.get("env"))
+    trained = saved.get("scenario", env.removeprefix("maobs/") if env.startswith("maobs/") else None)
+    if trained is None:
+        return {}  # of an environment that is not this package's
+    legal = cls.options_class.__dataclass_fields__
+    return {
+        name: value
+        for name, value in saved.items()
+        if name in legal and (trained in (scenario_id, cls) or name not in preset)
+    }
+
+
 def _saved_config(checkpoint: Path) -> Any:
     """Return the settings of a checkpoint's algorithm, by name."""
-    return pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())["ctor_args_and_kwargs"][0][0]
+    return pickle.loads((checkpoint / _ARGUMENTS).read_bytes())["ctor_args_and_kwargs"][0][0]
 
 
 def _check_actions(env: MAObsParallelEnv, agent: str, trained: Any, config: Any) -> None:

@@ -194,6 +194,8 @@ class JointAlgorithm(Algorithm):
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
         super().set_state(state)
+        if COMPONENT_LEARNER_GROUP in state:
+            self._send_weights()
         if "progress" in state:
             self._progress = dict(state["progress"])
         if COMPONENT_REPLAY_BUFFER in state:
@@ -201,6 +203,22 @@ class JointAlgorithm(Algorithm):
         if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
             starts = self._progress["env_steps"] + self._steps_before_learning()
             self._progress |= {"learning_starts": starts, "updates": 0}
+
+    @override(Algorithm)
+    def restore_from_path(self, path: Any, *args: Any, **kwargs: Any) -> None:
+        """Goes on from a checkpoint, or from one of its components."""
+        super().restore_from_path(path, *args, **kwargs)
+        self._send_weights()
+
+    def _send_weights(self) -> None:
+        """Sends all remote runners the weights; RLlib would not to those to which others are still on their way."""
+        for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None and group.num_remote_workers() > 0:
+                group.sync_weights(
+                    from_worker_or_learner_group=self.learner_group,
+                    timeout_seconds=self.config.sample_timeout_s,
+                    inference_only=True,
+                )
 
     @override(Algorithm)
     def set_weights(self, weights: dict[str, dict[str, Any]]) -> None:

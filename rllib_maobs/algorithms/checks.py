@@ -7,9 +7,9 @@ import shlex
 import shutil
 import sys
 from collections.abc import Collection
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import ALL_MODULES
@@ -112,20 +112,19 @@ def check_networks(config: JointConfig) -> None:
             f"{config.name} has no critics, so it takes neither critic ({config.critic!r}) nor critic_settings "
             f"({config.critic_settings!r}): its utilities are the actor."
         )
-    networks = [actor, critic] if config.critic_sees else [actor]
+    networks: list[type[Any]] = [actor, critic] if config.critic_sees else [actor]
     if isinstance(spec, MultiRLModuleSpec):  # policies may have others
         given = [own.model_config or {} for own in spec.rl_module_specs.values()]
         networks += [ACTORS.resolve(own["actor"]) for own in given if "actor" in own]
         networks += [CRITICS.resolve(own["critic"]) for own in given if "critic" in own]
+    names = " and ".join(network.__name__ for network in networks)
     for name in config._model_config:
         if not any(takes(network, name) for network in networks):
-            raise ValueError(
-                f"model_config[{name!r}] has no effect: {' and '.join(n.__name__ for n in networks)} take no such setting."
-            )
+            raise ValueError(f"model_config[{name!r}] has no effect: {names} take no such setting.")
 
 
 def _is_size(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and value > 0
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value > 0)
 
 
 def _check_model_config(given: Any, what: str, legal: Collection[str]) -> None:

@@ -19,6 +19,7 @@ from rllib_maobs.learner import MIXER, JointLearner
 from rllib_maobs.modules import ACTORS, CRITICS, EXPLORATIONS, Actor, AgentModule, Critic, MixerModule, RecurrentActor
 from rllib_maobs.runner import JointEnvRunner
 
+
 @dataclass(frozen=True)
 class Supports:
     """What an algorithm is defined for; validation, the README's table and the tests follow it.
@@ -221,6 +222,12 @@ class JointConfig(AlgorithmConfig):
         for name, value in given.items():
             if value is not NotProvided:
                 setattr(self, name, value)
+        return self
+
+    @override(AlgorithmConfig)
+    def env_runners(self, **kwargs: Any) -> Self:
+        """RLlib's, which would not take NumPy's numbers."""
+        super().env_runners(**{name: settings.plain(value) for name, value in kwargs.items()})
         return self
 
     @override(AlgorithmConfig)

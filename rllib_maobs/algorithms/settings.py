@@ -72,7 +72,7 @@ HONOURED: dict[str, str] = {
     **_each("env_runner_cls", "a JointEnvRunner"),
     **_each("num_env_runners num_envs_per_env_runner create_env_on_local_worker"),
     **_each("num_cpus_per_env_runner custom_resources_per_env_runner validate_env_runners_after_construction"),
-    **_each("sample_timeout_s explore"),
+    **_each("sample_timeout_s explore max_requests_in_flight_per_env_runner"),
     **_each("rollout_fragment_length", "steps of every copy between two rounds of updates"),
     # learners, training
     **_each("num_cpus_per_learner num_gpus_per_learner", "of the algorithm's own process"),
@@ -113,7 +113,6 @@ HARMLESS: dict[str, str] = {
     **_each("torch_compile_learner_what_to_compile", "the whole update is compiled, whichever is given"),
     **_each("is_atari", "there is no special treatment of Atari to switch on or off"),
     **_each("disable_env_checking", "environments are checked here by what they return"),
-    **_each("max_requests_in_flight_per_env_runner", "sampling waits for every runner, so there is one request"),
     **_each("max_requests_in_flight_per_learner", "the learner is in the algorithm's process"),
     **_each("episode_lookback_horizon episodes_to_numpy", "samples are arrays, not episodes"),
     **_each(
@@ -148,7 +147,9 @@ REFUSED: dict[str, str] = {
         "acting is not compiled; use torch_compile_learner=True for the updates",
     ),
     **_each("torch_ddp_kwargs", _LEARNER),
-    **_each("torch_skip_nan_gradients", "a NaN from the environment is an error here; use grad_clip against large steps"),
+    **_each(
+        "torch_skip_nan_gradients", "a NaN from the environment is an error here; use grad_clip against large steps"
+    ),
     **_each("enable_rl_module_and_learner enable_env_runner_and_connector_v2", "there is no old API stack here"),
     # environment
     **_each("observation_space action_space", "spaces are those that the environment declares; wrap it to change them"),
@@ -226,7 +227,7 @@ REFUSED: dict[str, str] = {
     **_each("count_steps_by", "steps are env steps, of the whole team"),
     **_each(
         "keep_per_episode_custom_metrics",
-        'it belongs to RLlib\'s old API stack; log single values in a callback with metrics_logger.log_value(..., '
+        "it belongs to RLlib's old API stack; log single values in a callback with metrics_logger.log_value(..., "
         'reduce="item_series")',
     ),
     **_each("metrics_episode_collection_timeout_s fake_sampler export_native_model_files", _OLD),
@@ -287,7 +288,7 @@ _NEEDS: dict[str, tuple[Callable[[JointConfig], bool], str]] = {
         'what the world state is made of needs critic_state="world", and an algorithm that sees the state',
     ),
     "seq_length": (lambda c: c.recurrent, "the length of windows needs a recurrent actor, e.g. actor='lstm'"),
-    "target_noise_clip": (lambda c: c.target_noise > 0, "the bound of target_noise needs target_noise > 0"),
+    "target_noise_clip": (lambda c: bool(vars(c)["target_noise"]), "the bound of target_noise needs target_noise > 0"),
     "grad_clip_by": (lambda c: c.grad_clip is not None, "how gradients are clipped needs grad_clip"),
 }
 """Settings of ours that have an effect only with others: when, and what the error says."""
@@ -311,6 +312,11 @@ def without_effect(config: JointConfig) -> dict[str, str]:
     }
 
 
+def plain(value: Any) -> Any:
+    """The number that a NumPy scalar is; anything else as it is."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def check_values(config: JointConfig) -> None:
     """Checks each setting by itself, and makes NumPy's scalars the numbers that they are.
 
@@ -319,7 +325,7 @@ def check_values(config: JointConfig) -> None:
     """
     for name, value in list(vars(config).items()):
         if isinstance(value, np.generic):
-            setattr(config, name, value.item())
+            setattr(config, name, plain(value))
     for name, hint in config.legal.items():
         setattr(config, name, check_value(getattr(config, name), hint, name, type(config).__name__))
 
@@ -354,7 +360,8 @@ def unknown(config: JointConfig, name: str) -> str:
     from rllib_maobs.algorithms.registry import ALGORITHMS
 
     owners = [other for other, cls in ALGORITHMS.items() if name in cls.legal]
-    hint = f"; it is one of {', '.join(owners)}" if owners else closest(name, [n for n in vars(config) if n[0] != "_"])
+    legal = [legal for legal in (*vars(type(config)()), *config.legal) if legal[0] != "_"]
+    hint = f"; it is one of {', '.join(owners)}" if owners else closest(name, legal)
     return f"{type(config).__name__} has no setting {name!r}{hint}."
 
 

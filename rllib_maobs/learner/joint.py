@@ -444,8 +444,9 @@ class JointLearner(TorchLearner):
                 f"This learner's state is that of other networks, or of agents that share them otherwise: {saved} was "
                 f"saved, here it would be {self._shapes()}."
             )
-        # RLlib's learner skips modules, and runners skip weights, that are not newer than their own: what is set is meant.
-        newest, self._weights_seq_no = self._weights_seq_no, 0
+        # RLlib's learner skips modules, and runners skip weights, that are not newer than their own; but what is set
+        # here is meant.
+        newest, self._weights_seq_no = self._weights_seq_no, 0  # type: ignore[has-type]
         super().set_state(state)
         self._weights_seq_no = max(self._weights_seq_no, newest + 1)
         self._adam.bind()  # the optimisers' tensors are new ones
