@@ -16,7 +16,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_TRAINED_LIFETIME
 import rllib_maobs as maobs
 from rllib_maobs.algorithms import settings
 from tests.conftest import ALGORITHMS, build_learner, small_config
-from tests.test_runner import TwoAgents
+from tests.test_runner import TwoAgents, runner_of, sample
 
 PAGE = Path(__file__).parent.parent / "docs" / "rllib_settings.md"
 EVERY = [(method, name) for method in settings.METHODS for name in settings.settings_of_method(method)]
@@ -245,10 +245,19 @@ def test_evaluation_beside_training_by_more_runners_than_episodes(ray_session: N
     algo.stop()
 
 
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_means_are_over_as_many_episodes_as_are_asked_for(ray_session: None, episodes: int) -> None:
+    config = small_config("iddpg", horizon=5).env_runners(num_envs_per_env_runner=1)
+    runner = runner_of(config.reporting(metrics_num_episodes_for_smoothing=episodes))
+    rewards = sample(runner, num_timesteps=20).rewards.reshape(4, -1)
+    results = runner.get_metrics()
+    assert results["episode_return_mean"].peek() == pytest.approx(rewards[-episodes:].sum(1).mean())
+
+
 def test_reporting_and_callbacks_are_honoured(ray_session: None) -> None:
     calls: list[str] = []
     config = small_config("iddpg", horizon=10).rl_module(model_config={"hidden_sizes": (8,)})
-    config.reporting(min_train_timesteps_per_iteration=800, metrics_num_episodes_for_smoothing=1)
+    config.reporting(min_train_timesteps_per_iteration=800)
     config.callbacks(
         on_algorithm_init=lambda **kwargs: calls.append("init"),
         on_train_result=lambda **kwargs: calls.append("result"),
@@ -257,18 +266,17 @@ def test_reporting_and_callbacks_are_honoured(ray_session: None) -> None:
     )
 
     def evaluate(algo: Any, runners: Any) -> tuple[dict[str, Any], int, int]:
-        algo.metrics.log_value(("evaluation", "mine"), 7)
-        return {"mine": 7}, 0, 0
+        runners.local_env_runner.sample(num_episodes=3)
+        metrics = runners.local_env_runner.get_metrics()
+        algo.metrics.aggregate([metrics], key=("evaluation", "env_runners"))
+        return {"episodes": 3}, 30, 90
 
     config.evaluation(evaluation_interval=1, custom_evaluation_function=evaluate)
     algo = config.build_algo()
     result = algo.train()
     assert result["learners"]["__all_modules__"][NUM_ENV_STEPS_TRAINED_LIFETIME] >= 800
-    assert result["evaluation"]["mine"] == 7
+    assert result["evaluation"]["env_runners"]["num_episodes"] == 3
     assert calls == ["init", "start", "end", "result"]
-    assert result["env_runners"]["num_episodes"] > 1
-    returns = result["env_runners"]
-    assert returns["episode_return_mean"] == returns["episode_return_max"] == returns["episode_return_min"]
     algo.stop()
 
 
