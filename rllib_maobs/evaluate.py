@@ -22,11 +22,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import bootstrap
 
-from rllib_maobs.checkpoints import find_checkpoint, saved_config
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
 from rllib_maobs.experiment.tables import format_table
 from rllib_maobs.play import parse_options, play
-from rllib_maobs.policies import make_policy, play_episodes
+from rllib_maobs.policies import make_policy, play_episodes, saved_options, trained_on
 
 # What the table shows, in its order, and how; a task reports those that make sense for it.
 LABELS = {
@@ -142,9 +141,11 @@ def jobs_of(
     Raises:
         ValueError: If the checkpoint, the environment or an option is illegal, or they do not fit.
     """
-    trained = task_of(checkpoint)
-    kept = trained.options if env in (None, trained.env) else {"action_mode": trained.options.get("action_mode", "mpe")}
-    task = Task(env or trained.env, {**kept, **options})
+    trained, _ = trained_on(checkpoint)
+    if env is None and trained not in SCENARIOS:
+        raise ValueError(f"{checkpoint!r} was trained on {trained}; give --env, one of {', '.join(SCENARIOS)}")
+    name = env or trained
+    task = Task(name, {**saved_options(checkpoint, name), **options})
     scenario = make_scenario(task.env, **task.options)
     # All options, also those that are not given: equal tasks are evaluated once.
     scenarios = [
@@ -155,20 +156,6 @@ def jobs_of(
         vec.reset(seed=seed)  # whether everything fits into the room
         make_policy(vec, checkpoint, seed)
     return [(checkpoint, Task(task.env, asdict(each.options))) for each in scenarios]
-
-
-def task_of(checkpoint: str) -> Task:
-    """Return what a checkpoint's training evaluated on.
-
-    Raises:
-        ValueError: If it is no checkpoint, or its environment is not one of this package.
-    """
-    config = saved_config(find_checkpoint(checkpoint))
-    options = {**(config.get("env_config") or {}), **((config.get("evaluation_config") or {}).get("env_config") or {})}
-    name = options.pop("scenario", None) or str(config.get("env")).removeprefix("maobs/")
-    if name not in SCENARIOS:
-        raise ValueError(f"{checkpoint!r} was trained on {config.get('env')}; legal: {', '.join(SCENARIOS)}")
-    return Task(name, options)
 
 
 def summarise_episodes(episodes: pd.DataFrame) -> pd.DataFrame:

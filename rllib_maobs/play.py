@@ -6,10 +6,11 @@
 
 Without `--record` the episodes run in a window, in real time. At the end the mean metrics are printed. CHECKPOINT is
 the folder of an RLlib algorithm checkpoint (of this package, or of a stock algorithm trained on `MAObsEnv`), or of a
-trial, whose last checkpoint counts; its policies act without exploration. Agents with entity networks that share a
-policy play teams of any size:
+trial, whose last checkpoint counts; its policies act without exploration. They play what they were evaluated on: the
+options in the checkpoint hold unless the command line says otherwise. Agents with entity networks that share a policy
+play teams of any size:
 
-    python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a action_mode=force
+    python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a
 """
 
 import argparse
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from rllib_maobs.envs import SCENARIOS, MAObsParallelEnv, Recorder, parallel_env
-from rllib_maobs.policies import CheckpointPolicy, Policy, make_policy
+from rllib_maobs.policies import CheckpointPolicy, Policy, make_policy, saved_options
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -45,12 +46,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--episodes {args.episodes} is illegal; legal: an integer >= 1")
     try:
         mode = "rgb_array" if args.record else None if args.no_window else "human"
-        env = parallel_env(args.env, render_mode=mode, **parse_options(args.options))
+        options = parse_options(args.options)
+        saved = {name: value for name, value in saved_options(args.policy, args.env).items() if name not in options}
+        env = parallel_env(args.env, render_mode=mode, **saved, **options)
         policy = make_policy(env.vector, args.policy, args.seed)
         recorder = Recorder(args.record) if args.record else None
     except (ValueError, ImportError) as error:
         parser.error(str(error))
     metrics = play(env, policy, args.episodes, args.seed, recorder)
+    if saved:
+        print(f"options of the checkpoint: {' '.join(f'{name}={value}' for name, value in saved.items())}")
     print(f"{args.env}, {args.policy}: mean over {args.episodes} episodes from seed {args.seed}")
     for name, value in metrics.items():
         print(f"  {name:24} {value:10.3f}")

@@ -14,7 +14,7 @@ from ray.rllib.core.rl_module import RLModule
 from ray.rllib.utils.spaces.space_utils import unsquash_action
 
 from rllib_maobs.checkpoints import find_checkpoint, module_folders, saved_config
-from rllib_maobs.envs import VectorEnv
+from rllib_maobs.envs import SCENARIOS, VectorEnv
 from rllib_maobs.layout import Layout
 from rllib_maobs.options import closest
 
@@ -71,6 +71,45 @@ def play_episodes(env: VectorEnv, policy: Policy, seed: int = 0) -> pd.DataFrame
         if finished.any() and running.any():  # Where episodes may terminate, the others go on.
             observations, _ = env.reset(mask=finished)
     return rows.assign(**{"return": returns})
+
+
+def saved_options(policy: str, scenario_id: str) -> dict[str, Any]:
+    """Return the environment options of a checkpoint, those of its evaluation where they differ from the training's.
+
+    Args:
+        policy: Folder of an algorithm checkpoint or of a trial; anything else has no options.
+        scenario_id: What is to be played. If that is not what was trained, its own preset options come first, such as
+            the number of agents of spread-9a.
+    """
+    try:
+        trained, saved = trained_on(policy)
+    except (ValueError, FileNotFoundError):
+        return {}
+    if scenario_id not in SCENARIOS or trained is None:
+        return {}  # of an environment that is not this package's
+    cls, preset = SCENARIOS[scenario_id]
+    legal = cls.options_class.__dataclass_fields__
+    return {
+        name: value
+        for name, value in saved.items()
+        if name in legal and (trained in (scenario_id, cls) or name not in preset)
+    }
+
+
+def trained_on(checkpoint: str) -> tuple[Any, dict[str, Any]]:
+    """Return what a checkpoint's training evaluated on.
+
+    Returns:
+        The scenario's id or class, None if it is not one of this package; and the environment's options.
+
+    Raises:
+        ValueError: If it is no checkpoint.
+    """
+    config = saved_config(find_checkpoint(checkpoint))
+    evaluation = config.get("evaluation_config") or {}
+    options = {**(config.get("env_config") or {}), **(evaluation.get("env_config") or {})}
+    env = str(config.get("env"))
+    return options.pop("scenario", env.removeprefix("maobs/") if env.startswith("maobs/") else None), options
 
 
 class CheckpointPolicy:

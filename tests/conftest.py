@@ -34,7 +34,9 @@ def small_config(algorithm: str, **options: Any) -> maobs.JointConfig:
         options = {"action_mode": "discrete", **options}
     config.environment("maobs/spread-3a", env_config=options)
     config.env_runners(num_envs_per_env_runner=2)
-    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000, seq_length=3)
+    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000)
+    if config.recurrent:
+        config.training(seq_length=3)
     config.reporting(min_sample_timesteps_per_iteration=40)
     return config.debugging(seed=0)
 

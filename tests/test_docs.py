@@ -28,7 +28,9 @@ def test_a_page_is_a_program(page: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CHANGELOG.md", *PAGES], ids=lambda page: page.stem)
 def test_links_lead_somewhere(page: Path) -> None:
     text = page.read_text()
-    anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.M)}
+    anchors = {
+        re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.M)
+    }
     anchors |= set(re.findall(r'<a id="([^"]+)"', text))
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         if target.startswith("#"):

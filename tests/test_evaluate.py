@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from rllib_maobs.envs import make_scenario, make_vec
-from rllib_maobs.evaluate import main, summarise_episodes, task_of
+from rllib_maobs.evaluate import jobs_of, main, summarise_episodes
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 from rllib_maobs.policies import make_policy, play_episodes
@@ -67,7 +67,7 @@ def test_means_have_intervals_that_hold_them() -> None:
 
 
 def test_a_trial_is_evaluated_as_its_training_was(trial_folder: Path, tmp_path: Path) -> None:
-    task = task_of(str(trial_folder))
+    ((_, task),) = jobs_of(str(trial_folder), None, [], {})
     assert (task.env, task.options["horizon"], task.options["agent_collision_penalty"]) == ("spread-3a", 8, 1.0)
     files = [tmp_path / name for name in ("table.csv", "table.json", "episodes.csv", "best.gif")]
     flags = [
@@ -116,7 +116,7 @@ def test_resized_tasks() -> None:
         (["agent_range=0.2", "--num-agents", 12], "use fewer or smaller bodies"),
         (["horzon=3"], "did you mean 'horizon'"),
         (["--env", "spread-4a"], "unknown scenario 'spread-4a'"),
-        (["--env", "obstacle-predator-prey"], "was trained on"),
+        (["--env", "obstacle-predator-prey"], "was trained on (18,)"),
         (["--csv", "FOLDER"], "exists: remove it, or choose another file"),
         (["--json", "FOLDER/no/x.json"], "there is no folder"),
     ],

@@ -559,8 +559,10 @@ def test_scripts_have_the_settings_of_the_paper(
         assert config.name == (spec.algorithm if spec.algorithm in maobs.ALGORITHMS else "facmac")
         assert len(config.team.agents) == agents
         assert (config.actor_lr, config.critic_lr, config.gamma) == (0.001, critic_lr, 0.95)
-        assert (config.train_batch_size_per_learner, config.seq_length) == (batch, seq_length)
-        assert (config.seed, config.critic_state, config.torch_compile_learner) == (5, "world", True)
+        assert config.train_batch_size_per_learner == batch
+        assert config.window_length == (seq_length if config.recurrent else 0)
+        assert config.critic_state == ("world" if config.uses_state else "observations")
+        assert (config.seed, config.torch_compile_learner) == (5, True)
         assert (spec.stop_timesteps, spec.num_envs_per_env_runner, spec.one_policy) == (2_000_000, 8, False)
         # Training episodes are short, evaluation is the paper's: 10 noise-free episodes of 100 steps.
         evaluation = config.get_evaluation_config_object()

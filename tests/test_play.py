@@ -1,5 +1,7 @@
 """The command that shows and films episodes, with every kind of policy."""
 
+import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -11,10 +13,10 @@ from PIL import Image
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from rllib_maobs.envs import MAObsEnv, make_vec, parallel_env
+from rllib_maobs.envs import MAObsEnv, Spread, make_vec, parallel_env
 from rllib_maobs.play import main, parse_options, play
-from rllib_maobs.policies import CheckpointPolicy, make_policy
-from tests.conftest import small_config
+from rllib_maobs.policies import CheckpointPolicy, make_policy, saved_options
+from tests.conftest import build_learner, small_config
 
 
 def test_command_line_films(tmp_path):
@@ -196,6 +198,69 @@ def entity_checkpoint(ray_session, tmp_path_factory):
     module = algo.get_module("all")
     yield path, module
     algo.stop()
+
+
+def test_a_checkpoint_plays_what_it_was_evaluated_on(ray_session, tmp_path, capsys):
+    config = small_config("iddpg", horizon=7, num_agents=2, action_mode="force", num_obstacles=1)
+    config.evaluation(evaluation_config={"env_config": {"horizon": 9}})
+    algo = config.build_algo()
+    path = algo.save_to_path(str(tmp_path))
+    algo.stop()
+    options = {"horizon": 9, "num_agents": 2, "action_mode": "force", "num_obstacles": 1}
+    assert saved_options(path, "spread-3a") == options
+    # Another task keeps what its own name says.
+    assert saved_options(path, "spread-9a") == {"horizon": 9, "action_mode": "force"}
+    assert saved_options(path, "simple-tunnel") == {"horizon": 9, "num_agents": 2, "action_mode": "force"}
+    for nothing in ("random", "heuristic", str(tmp_path / "none")):
+        assert saved_options(nothing, "spread-3a") == {}
+    main(["spread-3a", "--policy", path, "--no-window"])
+    printed = capsys.readouterr().out
+    assert "options of the checkpoint: horizon=9 num_agents=2 action_mode=force num_obstacles=1" in printed
+    assert re.search(r"episode_length +9.000", printed)
+    main(["spread-3a", "--policy", path, "--no-window", "horizon=4"])
+    assert re.search(r"episode_length +4.000", capsys.readouterr().out)
+
+
+def test_options_of_stock_ppo_and_of_foreign_environments(tmp_path):
+    def checkpoint(name, **config):
+        (tmp_path / name / "learner_group" / "learner" / "rl_module").mkdir(parents=True)
+        arguments = {"ctor_args_and_kwargs": (({"evaluation_config": None, **config},), {})}
+        (tmp_path / name / "class_and_ctor_args.pkl").write_bytes(pickle.dumps(arguments))
+        return str(tmp_path / name)
+
+    ours = checkpoint("ours", env=MAObsEnv, env_config={"scenario": "tunnel", "gap": 0.3, "render_mode": "human"})
+    assert saved_options(ours, "tunnel") == {"gap": 0.3}
+    assert saved_options(checkpoint("class", env="x", env_config={"scenario": Spread, "horizon": 5}), "spread-3a")
+    assert saved_options(checkpoint("foreign", env="mine", env_config={"horizon": 5}), "tunnel") == {}
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "iql"])
+def test_a_normalised_agent_takes_its_normaliser_along(ray_session, tmp_path, algorithm):
+    """In an algorithm's checkpoint, as its module, and as a network without RLlib."""
+    algo = small_config(algorithm).training(normalize_observations=True).build_algo()
+    algo.train()
+    path, module = algo.save_to_path(str(tmp_path / "checkpoint")), algo.get_module("agent_1")
+    algo.stop()
+    obs = 3.0 + torch.randn(5, 18, generator=torch.Generator().manual_seed(0))
+    want = module.forward_inference({"obs": obs})["actions"]
+    plain = module.acting(obs)
+    assert not torch.allclose(want.float(), plain.argmax(-1).float() if algorithm == "iql" else torch.tanh(plain))
+    network = module.exportable()
+    torch.testing.assert_close(network(obs), want)
+    torch.jit.trace(network, obs).save(tmp_path / "agent.pt")
+    torch.testing.assert_close(torch.jit.load(tmp_path / "agent.pt")(obs), want)
+    env = parallel_env("spread-3a", **saved_options(path, "spread-3a"))
+    observations, _ = env.reset(seed=0)
+    seen = torch.from_numpy(observations["agent_1"])[None]
+    (action,) = module.forward_inference({"obs": seen})["actions"].detach().numpy()
+    acted = acts(make_policy(env.vector, path), observations)["agent_1"]
+    np.testing.assert_allclose(acted, action, rtol=1e-5, atol=1e-6)
+
+
+def test_a_recurrent_agent_is_no_plain_network(ray_session):
+    learner = build_learner(small_config("maddpg-lstm"))
+    with pytest.raises(ValueError, match="its actions depend on a window of observations"):
+        learner.module["agent_0"].exportable()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
 from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
@@ -23,6 +24,7 @@ from ray.rllib.utils.metrics import (
     TIMERS,
 )
 
+from rllib_maobs.algorithms.checks import check_machine
 from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
@@ -53,7 +55,12 @@ class JointAlgorithm(Algorithm):
 
     @override(Algorithm)
     def setup(self, config: AlgorithmConfig) -> None:
-        """Builds the replay buffer and lets local runners act with the learner's own tensors."""
+        """Builds the replay buffer and lets local runners act with the learner's own tensors.
+
+        Raises:
+            ValueError: If this machine lacks what the configuration needs: a GPU, or a compiler.
+        """
+        check_machine(config)
         super().setup(config)
         team: Team = self.config.team
         self._learner: JointLearner = self.learner_group._learner
@@ -187,6 +194,8 @@ class JointAlgorithm(Algorithm):
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
         super().set_state(state)
+        if COMPONENT_LEARNER_GROUP in state:
+            self._send_weights()
         if "progress" in state:
             self._progress = dict(state["progress"])
         if COMPONENT_REPLAY_BUFFER in state:
@@ -194,6 +203,57 @@ class JointAlgorithm(Algorithm):
         if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
             starts = self._progress["env_steps"] + self._steps_before_learning()
             self._progress |= {"learning_starts": starts, "updates": 0}
+
+    @override(Algorithm)
+    def restore_from_path(self, path: Any, *args: Any, **kwargs: Any) -> None:
+        """Goes on from a checkpoint, or from one of its components."""
+        super().restore_from_path(path, *args, **kwargs)
+        self._send_weights()
+
+    def _send_weights(self) -> None:
+        """Sends all remote runners the weights; RLlib would not to those to which others are still on their way."""
+        for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None and group.num_remote_workers() > 0:
+                group.sync_weights(
+                    from_worker_or_learner_group=self.learner_group,
+                    timeout_seconds=self.config.sample_timeout_s,
+                    inference_only=True,
+                )
+
+    @override(Algorithm)
+    def set_weights(self, weights: dict[str, dict[str, Any]]) -> None:
+        """Sets the weights of modules, as `get_weights()` gives them, here and in all runners."""
+        self.set_state({COMPONENT_LEARNER_GROUP: {COMPONENT_LEARNER: {COMPONENT_RL_MODULE: weights}}})
+
+    @override(Algorithm)
+    def _before_evaluate(self) -> None:
+        if self.eval_env_runner_group is None:
+            raise ValueError(
+                "evaluate() needs runners of its own: config.evaluation(evaluation_interval=...) or "
+                "(evaluation_num_env_runners=...) makes them. It would reset the training environments, and explore."
+            )
+
+    def _use_modules(self, *args: Any, **kwargs: Any) -> Any:
+        """Takes the place of what RLlib has for policies, of which there are none on its new API stack."""
+        agent = self.config.team.agents[0]
+        raise NotImplementedError(
+            "There are no policies on RLlib's new API stack: take an agent's module, module = "
+            f"algo.get_module({self.config.module_ids[0]!r}), and act with "
+            'module.forward_inference({"obs": obs})["actions"], observations (B, O) to actions (B, A) in [-1, 1]; '
+            f"{agent!r} is the first of the agents."
+        )
+
+    get_policy = compute_single_action = compute_actions = add_policy = remove_policy = _use_modules
+    export_policy_model = export_policy_checkpoint = _use_modules
+
+    def _fixed_team(self, *args: Any, **kwargs: Any) -> Any:
+        """Takes the place of what changes the modules in mid-training."""
+        raise NotImplementedError(
+            "The team's modules are fixed, since they are learned in one stacked update: build an algorithm with "
+            "config.multi_agent(policies=..., policy_mapping_fn=...) for others."
+        )
+
+    add_module = remove_module = _fixed_team
 
     @override(Algorithm)
     def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:

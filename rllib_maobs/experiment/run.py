@@ -17,6 +17,8 @@ import ray
 from ray import tune
 
 import rllib_maobs as maobs
+from rllib_maobs.algorithms.checks import check_compiler
+from rllib_maobs.algorithms.settings import without_effect
 from rllib_maobs.checkpoints import saved_networks
 from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
 from rllib_maobs.experiment.baselines import play_baselines
@@ -119,6 +121,8 @@ class Experiment:
         _quiet()
         try:
             specs = self.specs(args)
+            if any(spec.torch_compile for spec in specs) and not args.address:
+                check_compiler()
             for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
                 config = spec.build_config()
                 config.validate()
@@ -149,6 +153,10 @@ class Experiment:
         depends = {key for key, value in training.items() if callable(value) and not isinstance(value, type)}
         training = {key: value(steps) if key in depends else value for key, value in training.items()}
         horizon = args.train_horizon or own["train_horizon"]
+        # What all rows share need not mean something to each, such as critic_state to IDDPG.
+        config = maobs.ALGORITHMS[row.get("algorithm", algorithm)]().training(**training)
+        unheard = {*without_effect(config)} - {*row}
+        training = {key: value for key, value in training.items() if key not in unheard}
         env_config = {**self.env_config, **own["env_config"]}
         return TrialSpec(
             algorithm=algorithm,
@@ -173,7 +181,7 @@ class Experiment:
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
         """Measure, train, report; return the exit code."""
-        _start_ray(args)
+        started = _start_ray(args)
         try:
             maobs.register()
             args.results_dir.mkdir(parents=True, exist_ok=True)
@@ -186,7 +194,8 @@ class Experiment:
                 tuner = _make_tuner(self.name, args, specs)
             trials = tuner.fit()
         finally:
-            ray.shutdown()
+            if started:
+                ray.shutdown()
         return self._report(args, trials, specs)
 
     def _print_plan(self, args: Namespace, specs: list[TrialSpec]) -> None:
@@ -282,14 +291,20 @@ def _quiet() -> None:
     os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
 
 
-def _start_ray(args: Namespace) -> None:
-    """Start Ray on this machine with one CPU per process of a trial, or connect to a cluster."""
+def _start_ray(args: Namespace) -> bool:
+    """Start Ray on this machine with one CPU per process of a trial, or connect to a cluster.
+
+    Returns:
+        Whether it was for this to do: a program that has started Ray already goes on with it.
+    """
+    if ray.is_initialized():
+        return False
     if args.address:
         try:
             ray.init(address=args.address, log_to_driver=False, logging_level=logging.ERROR)
         except ConnectionError as error:
             sys.exit(f"error: --address {args.address}: {error}")
-        return
+        return True
     if args.dashboard and find_spec("aiohttp") is None:
         sys.exit('error: --dashboard needs Ray\'s dashboard: pip install -c constraints.txt "ray[default]"')
     ray.init(
@@ -299,6 +314,7 @@ def _start_ray(args: Namespace) -> None:
         log_to_driver=False,
         logging_level=logging.ERROR,
     )
+    return True
 
 
 def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:

@@ -143,7 +143,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             **kwargs: Ignored.
 
         Returns:
-            One `JointSample` in a list.
+            One `JointSample` in a list; none if none is asked for.
 
         Raises:
             ValueError: If an observation or reward is not finite; names the agent, copy and step.
@@ -152,6 +152,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             raise ValueError(f"{self} has no environment, so it cannot sample.")
         if num_timesteps is not None and num_episodes is not None:
             raise ValueError("Give either num_timesteps or num_episodes, not both.")
+        if num_timesteps == 0 or num_episodes == 0:
+            return []  # an evaluation has less to play than it has runners
         explore = self.config.explore if explore is None else explore
         with self.metrics.log_time(SAMPLE_TIMER):
             if force_reset or num_episodes is not None or self._needs_reset:
