@@ -23,6 +23,43 @@ from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
 from rllib_maobs.layout import Entities, Layout, flat
 
 
+class InOrder:
+    """An environment whose agents stand in another order in all arrays.
+
+    Args:
+        env: The environment.
+        agents: Its agents, in the new order.
+    """
+
+    def __init__(self, env: JointEnv, agents: Sequence[str]) -> None:
+        self._env = env
+        self.num_envs, self.agents = env.num_envs, list(agents)
+        self.observation_spaces, self.action_spaces = env.observation_spaces, env.action_spaces
+        for name in ("observation_layouts", "state_layout", "shared_reward"):
+            setattr(self, name, getattr(env, name, None))
+        self._ours = [env.agents.index(agent) for agent in agents]
+        self._theirs = [self.agents.index(agent) for agent in env.agents]
+
+    def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
+        """Resets all copies, or those of `mask`."""
+        obs, info = self._env.reset(seed=seed, mask=mask)
+        return obs[:, self._ours], info
+
+    def step(self, actions: Float) -> StepResult:
+        """Steps every copy."""
+        obs, rewards, terminated, truncated, info = self._env.step(actions[:, self._theirs])
+        terminated = terminated if terminated.ndim == 1 else terminated[:, self._ours]
+        return obs[:, self._ours], rewards[:, self._ours], terminated, truncated, info
+
+    def state(self, kind: str | None = None) -> Float:
+        """The environment's own state `(E, S)`, as it is."""
+        return self._env.state(kind)
+
+    def close(self) -> None:
+        """Closes every copy."""
+        self._env.close()
+
+
 class WithAgentIds:
     """An environment whose observations begin with the agent's number as a one-hot vector.
 

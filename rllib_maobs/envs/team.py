@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -57,7 +58,9 @@ class Team:
     fit into arrays `(..., N, O)` and `(..., N, A)`. A discrete action is a one-hot vector in those arrays.
 
     Attributes:
-        agents: Agent ids in the environment's order: the order of every N axis.
+        agents: Agent ids in the order of every N axis, whatever order an environment lists them in: that of their
+            names ("agent_2" before "agent_10"), which is the same in every process. An environment that says what
+            its state is made of keeps its own order: that layout names agents by their places.
         observation_spaces: Every agent's observation space.
         action_spaces: Every agent's action space: all bounded vectors, or all Discrete.
         observation_layouts: What every agent's observation is made of; one group "observation" where that is unknown.
@@ -114,6 +117,39 @@ class Team:
         index = self.agents.index(agent)
         return self.observation_spaces[index], self.action_spaces[index]
 
+    def ordered(self, agents: Sequence[str]) -> Team:
+        """The same team in the order of `agents`, which are the same ids."""
+        order = [self.agents.index(agent) for agent in agents]
+        permuted: dict[str, Any] = {
+            name: tuple(getattr(self, name)[i] for i in order)
+            for name in ("agents", "observation_spaces", "action_spaces", "observation_layouts")
+        }
+        return replace(self, **permuted)
+
+    def check(self, env: JointEnv, name: str) -> None:
+        """Checks that an environment is one of this team's, though it may list its agents in another order.
+
+        Args:
+            env: The environment.
+            name: What to call it.
+
+        Raises:
+            ValueError: If its agents are others, or have other spaces.
+        """
+        if set(env.agents) != set(self.agents):
+            raise ValueError(
+                f"The agents of {name} are {sorted(env.agents)}, but the team is {sorted(self.agents)}: legal is the "
+                f"same set of agents, in any order, in every runner, in evaluation and after a restore."
+            )
+        for agent in self.agents:
+            observation, action = self.spaces(agent)
+            seen, acted = env.observation_spaces[agent], env.action_spaces[agent]
+            if seen.shape != observation.shape or acted != action:
+                raise ValueError(
+                    f"The spaces of agent {agent!r} in {name} are {seen} and {acted}, but in the team {observation} "
+                    f"and {action}: legal are observations of the same size and the same actions."
+                )
+
     @classmethod
     def of(
         cls,
@@ -137,6 +173,8 @@ class Team:
                 not add up or belongs to no agent; says which and what is legal.
         """
         agents = tuple(env.agents)
+        if state_layout is None and getattr(env, "state_layout", None) is None:
+            agents = tuple(sorted(agents, key=_by_name))
         for agent in agents:
             space = env.observation_spaces[agent]
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
@@ -177,6 +215,12 @@ class Team:
             ),
             _state_layout(env, state_layout) if with_state else None,
         )
+
+
+def _by_name(agent: str) -> tuple[list[str | int], str]:
+    """What names are sorted by: numbers in them count as numbers."""
+    parts = re.split(r"(\d+)", str(agent))
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], str(agent)
 
 
 def _state_layout(env: JointEnv, given: Groups | None) -> Layout:

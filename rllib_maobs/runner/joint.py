@@ -105,7 +105,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         """Makes the E copies anew; they are reset at the next `sample()`."""
         if self.env is not None:
             self.env.close()
-        self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
+        self.env = make_env(self.config, self.num_envs, self.worker_index or 0, self.team)
         self._needs_reset = True
 
     @override(EnvRunner)
