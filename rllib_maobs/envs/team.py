@@ -40,7 +40,8 @@ class JointEnv(Protocol):
     def step(self, actions: Float) -> StepResult:
         """Steps all copies by `(E, N, A)`, or by the numbers `(E, N)` of discrete actions.
 
-        Returns observations, rewards `(E, N)`, terminated, truncated `(E,)`, info.
+        Returns observations, rewards `(E, N)`, terminated, truncated `(E,)`, info. Where agents end differently,
+        terminated says it of each, `(E, N)`, and truncated whether a time limit ended the episode for the others.
         """
 
     def state(self, kind: str | None = None) -> Float:
@@ -234,6 +235,11 @@ def _layout(groups: Groups | None, what: str, size: int, owner: str = "") -> Lay
     return flat(size, what) if groups is None else as_layout(groups, size, f"{what}{owner}")
 
 
+def finished(terminated: Bool, truncated: Bool) -> Bool:
+    """Which episodes are over, `(...)`: terminated for all agents `(..., N)`, or truncated `(...)` for some."""
+    return truncated | (terminated if terminated.ndim == truncated.ndim else terminated.all(-1))
+
+
 def shares_reward(env: JointEnv, steps: int = 25) -> bool:
     """Whether all agents always get the same reward: what the environment says, or else what random steps show.
 
@@ -260,6 +266,6 @@ def shares_reward(env: JointEnv, steps: int = 25) -> bool:
         _, rewards, terminated, truncated, _ = env.step(actions[..., 0].astype(np.int64) if discrete else actions)
         if np.ptp(rewards, axis=1).max() > REWARD_TOLERANCE * max(1.0, float(np.abs(rewards).max())):
             return False
-        if (terminated | truncated).any():
-            env.reset(mask=terminated | truncated)
+        if (over := finished(terminated, truncated)).any():
+            env.reset(mask=over)
     return True

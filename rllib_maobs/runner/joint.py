@@ -29,7 +29,7 @@ from ray.rllib.utils.metrics import (
 )
 
 from rllib_maobs.envs.joint import snapshot
-from rllib_maobs.envs.team import JointEnv, Team
+from rllib_maobs.envs.team import JointEnv, Team, finished
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
 from rllib_maobs.runner.acting import Acting
@@ -58,7 +58,7 @@ class JointSample:
 
     def env_steps(self) -> int:
         """L * E."""
-        return self.terminated.size
+        return self.truncated.size
 
     def agent_steps(self) -> int:
         """L * E * N."""
@@ -190,7 +190,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         while (left > 0).any():
             row, final = self._step(explore, random_actions, counted=left > 0)
             steps.append((row, final))
-            left -= row["terminated"] | row["truncated"]
+            left -= finished(row["terminated"], row["truncated"])
         return steps
 
     def _step(
@@ -207,13 +207,16 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             t = self.num_env_steps_sampled_lifetime
             row["actions"] = self.acting(self._obs, t, explore=explore, random=random_actions)
         played = self.acting.to_env(row["actions"])
-        self._obs, row["rewards"], row["terminated"], row["truncated"], info = self.env.step(played)
+        self._obs, row["rewards"], terminated, row["truncated"], info = self.env.step(played)
+        done = finished(terminated, row["truncated"])
+        row["terminated"] = (
+            terminated if terminated.ndim == 2 else terminated[:, None].repeat(row["rewards"].shape[1], 1)
+        )
         self._episodes.add(row["rewards"])
         self._check_finite("observation", self._obs)
         self._check_finite("reward", row["rewards"])
         self._steps_sampled += 1
         self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
-        done = row["terminated"] | row["truncated"]
         if not done.any():
             return row, {name: row[name][:0] for name in ("obs", "state", "recurrent_state") if name in row}
         final = {name: values[done] for name, values in self._sight().items()}
@@ -240,7 +243,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         copy, agent = np.argwhere(~np.isfinite(values))[0][:2]
         raise ValueError(
             f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._episodes.lengths[copy]} "
-            f"of its episode in environment copy {copy} (runner {self.worker_index}): {values[copy, agent]}."
+            f"of its episode in environment copy {copy} of {self.config.env} (runner {self.worker_index}): "
+            f"{values[copy, agent]}; legal: finite numbers."
         )
 
     @override(EnvRunner)
