@@ -7,7 +7,6 @@ environment lists its agents.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
@@ -157,8 +156,9 @@ def make_joint_env(creator: Callable[[Any], Any], context: Mapping[str, Any], nu
         return joint
     envs = [env, *(creator(_own_context(context, copy)) for copy in range(1, num_envs))]
     for copy, one in enumerate(envs):
-        if any(_innermost(one) is _innermost(other) for other in envs[:copy]):
-            shared = f"copies 0 and {copy} of {_name_of(env)} are"
+        same = [_innermost(other) is _innermost(one) for other in envs[:copy]]
+        if any(same):
+            shared = f"copies {same.index(True)} and {copy} of {_name_of(env)} are"
         elif id(_innermost(one)) in _stepped:
             shared = f"copy {copy} of {_name_of(env)} and one of another runner (of evaluation, or not stopped) are"
         else:
@@ -420,11 +420,3 @@ def _kinds(result: Any) -> str:
     if not isinstance(result, tuple):
         return f"a {type(result).__name__}"
     return f"{len(result)} values ({', '.join(type(part).__name__ for part in result)})"
-
-
-def snapshot(env: JointEnv) -> bytes | None:
-    """An environment in the middle of its episodes as bytes, or None if it cannot be pickled."""
-    try:
-        return pickle.dumps(env)
-    except Exception:
-        return None

@@ -195,10 +195,10 @@ class Team:
                     f"The actions of agents {agents[0]!r} and {agent!r} must both be Box or both Discrete, but are "
                     f"{actions[0]} and {space}."
                 )
-            if isinstance(space, gym.spaces.Box) and not space.is_bounded("both"):
+            if isinstance(space, gym.spaces.Box) and not _can_be_scaled_to(space):
                 raise ValueError(
-                    f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs "
-                    f"finite bounds to scale to."
+                    f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs finite bounds "
+                    f"to scale to, whose distance is finite in their type (of integers, bounds within 2**53)."
                 )
         observations = tuple(env.observation_spaces[agent] for agent in agents)
         layouts: dict[str, Groups | None] = dict(getattr(env, "observation_layouts", None) or {})
@@ -222,6 +222,16 @@ def _by_name(agent: str) -> tuple[list[str | int], str]:
     """What names are sorted by: numbers in them count as numbers."""
     parts = re.split(r"(\d+)", str(agent))
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], str(agent)
+
+
+def _can_be_scaled_to(space: gym.spaces.Box) -> bool:
+    """Whether there are bounds, between which arithmetic does not overflow."""
+    if not space.is_bounded("both"):
+        return False
+    if np.issubdtype(space.dtype, np.integer):
+        return bool((space.low >= -(2.0**53)).all() and (space.high <= 2.0**53).all())
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(space.high - space.low).all())
 
 
 def _state_layout(env: JointEnv, given: Groups | None) -> Layout:
@@ -255,7 +265,7 @@ def shares_reward(env: JointEnv, steps: int = 25) -> bool:
     spaces = [env.action_spaces[agent] for agent in env.agents]
     size = max(flatdim(space) for space in spaces)
     for _ in range(steps):
-        actions = np.zeros((env.num_envs, len(spaces), size), dtype=np.float32)
+        actions = np.zeros((env.num_envs, len(spaces), size))
         for agent, space in enumerate(spaces):
             if isinstance(space, gym.spaces.Discrete):
                 actions[:, agent, 0] = rng.integers(space.n, size=env.num_envs)

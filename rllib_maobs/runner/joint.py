@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import pickle
 import uuid
@@ -27,8 +28,9 @@ from ray.rllib.utils.metrics import (
     SAMPLE_TIMER,
     WEIGHTS_SEQ_NO,
 )
+from ray.util import log_once
 
-from rllib_maobs.envs.joint import snapshot
+from rllib_maobs.envs.snapshot import snapshot
 from rllib_maobs.envs.team import JointEnv, Team, finished
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
@@ -36,6 +38,7 @@ from rllib_maobs.runner.acting import Acting
 from rllib_maobs.runner.episodes import EPISODE_METRICS, Episodes
 from rllib_maobs.runner.making import make_env
 
+logger = logging.getLogger(__name__)
 COMPONENT_SAMPLING = "sampling"
 
 
@@ -81,11 +84,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self.module_ids: tuple[str, ...] = self.config.module_ids
         self.env: JointEnv | None = None
         self.num_envs: int = self.config.num_envs_per_env_runner
-        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
-        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
-        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation),))
-        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
-        self._generator = torch.Generator().manual_seed(int(seeds.generate_state(1)[0]))
+        self._generator = torch.Generator()
+        self._seed_anew()
         if self.worker_index is None or self.worker_index > 0 or self.num_workers == 0:
             self.make_env()
         elif self.config.create_env_on_local_worker:
@@ -99,6 +99,14 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._episodes = Episodes(self.team.agents, self.module_ids, self.num_envs)
         self._steps_sampled = 0
         self._source = f"{self.worker_index}-{uuid.uuid4().hex}"
+
+    def _seed_anew(self, *after: int) -> None:
+        """Seeds the copies' next first reset, and exploration; after some steps otherwise than at the start."""
+        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
+        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
+        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation), *after))
+        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
+        self._generator.manual_seed(int(seeds.generate_state(1)[0]))
 
     @override(EnvRunner)
     def make_env(self) -> None:
@@ -287,7 +295,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         not_components: str | Collection[str] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Weights, step count, and where the copies are in their episodes (if the environment can be pickled)."""
+        """Weights, step count, and where the copies are in their episodes (see `snapshot`)."""
         state: dict[str, Any] = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self.num_env_steps_sampled_lifetime}
         if self.module is not None and self._check_component(COMPONENT_RL_MODULE, components, not_components):
             state[COMPONENT_RL_MODULE] = self.module.get_state(
@@ -308,7 +316,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
     @override(Checkpointable)
     def set_state(self, state: dict[str, Any]) -> None:
-        """Goes on from a saved state; an environment that could not be saved starts new episodes."""
+        """Goes on from a saved state; an environment that would not go on exactly starts new episodes."""
         if COMPONENT_RL_MODULE in state and self.module is not None:
             seq_no = state.get(WEIGHTS_SEQ_NO, 0)
             if seq_no == 0 or self._weights_seq_no < seq_no:
@@ -323,7 +331,14 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         if sampling is None or self.env is None or sampling["in_evaluation"] != self.config.in_evaluation:
             return
         if sampling["env"] is None or sampling["num_envs"] != self.num_envs:
-            self._needs_reset = True
+            if log_once(f"new episodes of {self.config.env}"):
+                logger.warning(
+                    f"Environment {self.config.env} starts new episodes: it cannot be continued exactly where it was "
+                    f"saved (its copies do not come back from pickle as they were, or are others in number)."
+                )
+            # Not those that the run began with: episodes and noise would repeat themselves.
+            self._seed_anew(sampling["_steps_sampled"])
+            self._obs, self._needs_reset = None, True
             return
         self.env = pickle.loads(sampling["env"])
         self.acting.set_state(sampling["acting"])
