@@ -66,6 +66,13 @@ class Pair(ParallelEnv):
         return result if self.change is None else self.change(self, *result)
 
 
+SHARED = Pair()
+
+
+def shared_pair(context: Any) -> Pair:
+    return SHARED
+
+
 def played(env: Any, steps: int = 5) -> list[Any]:
     """What a stacked environment returns step by step."""
     env.reset(seed=0)
@@ -155,7 +162,7 @@ def test_copies_that_are_one_object_are_refused(ray_session: None) -> None:
         with pytest.raises(ValueError, match=r"copies 1 and 3 of Pair are one object: .* must return a new one"):
             make_joint_env(lambda context, envs=envs, wrap=wrap: wrap(next(envs)), {}, 4)
     # With one copy each, training and evaluation would step the same object.
-    tune.register_env("pair", lambda context: shared)
+    tune.register_env("pair", shared_pair)
     config = small_config("maddpg").environment("pair", env_config={}).env_runners(num_envs_per_env_runner=1)
     config.evaluation(evaluation_interval=1)
     with pytest.raises(ValueError, match=r"copy 0 of Pair and one of another runner .* are one object"):
