@@ -189,10 +189,11 @@ def test_every_copy_has_its_own_config() -> None:
 
 def last_of(change: Callable[..., Any], wrapped: bool = False) -> tuple[list[bool], bool]:
     """Which agents terminated in the last step, and whether others were truncated."""
-    env = Pair(change)
-    results = played(StackedEnv([ParallelPettingZooEnv(env) if wrapped else env]))
+    env = StackedEnv([ParallelPettingZooEnv(Pair(change)) if wrapped else Pair(change)])
+    results = played(env)
     assert not any(finished(result[2], result[3]).any() for result in results[:-1])
-    return results[-1][2][0].tolist(), bool(results[-1][3][0])
+    terminated = dict(zip(env.agents, results[-1][2][0].tolist(), strict=True))  # RLlib's wrapper lists a set
+    return [terminated["a"], terminated["b"]], bool(results[-1][3][0])
 
 
 def flags(**of: tuple[bool, bool]) -> Callable[..., Any]:
