@@ -379,7 +379,11 @@ def test_what_cannot_be_continued_starts_a_new_episode(
     obs = runner.sample(num_timesteps=6)[0].obs[:, 0, 0, 0].tolist()
     assert obs == ([7.0, 8.0, 9.0] if exact else [0.0, 1.0, 2.0])
     assert runner._episodes.lengths.tolist() == ([10, 10] if exact else [3, 3])
-    actions = [one.env_runner.sample(num_timesteps=2, random_actions=True)[0].actions for one in (algo, restored[1])]
-    assert (actions[0] == actions[1]).all() == exact  # noise does not begin again, either
+    # Random numbers go on with an exact copy; otherwise they are new ones, too, not those that the run began with.
+    config.validate()
+    begun = JointEnvRunner(config=config, worker_index=0, num_workers=0)
+    runners = [algo.env_runner, restored[1].env_runner, begun]
+    going_on, again, at_first = (one.sample(num_timesteps=2, random_actions=True)[0].actions for one in runners)
+    assert (going_on == again).all() == exact and (again != at_first).any()
     for one in (algo, *restored):
         one.stop()
