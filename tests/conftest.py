@@ -59,7 +59,8 @@ def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Ba
     else:
         actions, noise = torch.tanh(normal(size, n, a)) * legal, normal(size, n, a)
     rewards = normal(size, 1).expand(-1, n).clone() if config.supports.team_reward else normal(size, n)
-    discount = config.gamma**config.n_step * (normal(size, 1) < 0.5).to(torch.get_default_dtype())
+    goes_on = (normal(size, 1) < 0.5) & (normal(size, n) < 0.8)  # nobody, all, or some
+    discount = config.gamma**config.n_step * goes_on.to(torch.get_default_dtype())
 
     def moment(name: str) -> Moment:
         obs = normal(size, n, o) * present

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+import pickle
+from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from pyarrow.fs import FileSystem, FileType
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
+from ray.rllib.core import (
+    COMPONENT_LEARNER,
+    COMPONENT_LEARNER_GROUP,
+    COMPONENT_METRICS_LOGGER,
+    COMPONENT_RL_MODULE,
+)
 from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
@@ -45,6 +53,7 @@ class JointAlgorithm(Algorithm):
     """
 
     config_class: ClassVar[type[JointConfig]] = JointConfig
+    config: Any
     replay_buffer: JointReplayBuffer
 
     @classmethod
@@ -174,6 +183,44 @@ class JointAlgorithm(Algorithm):
         if report is not None:
             self.metrics.aggregate([report], key=LEARNER_RESULTS)
 
+    def _follow(self, agents: Sequence[str] | None) -> None:
+        """Builds everything anew if a saved team, whose state is to be taken over, stands in another order.
+
+        Networks of a centralised critic have weights for every agent's place, so the order is taken over with them.
+
+        Raises:
+            ValueError: If its agents are others.
+        """
+        team: Team = self.config.team
+        if agents is None or tuple(agents) == team.agents:
+            return
+        if set(agents) != set(team.agents):
+            raise ValueError(
+                f"The saved team is {sorted(agents)}, but the agents of {self.config.env!r} are "
+                f"{sorted(team.agents)}: a run goes on with the same set of agents only."
+            )
+        config: JointConfig = self.config.copy(copy_frozen=False)
+        config.team = team.ordered(agents)
+        config.validate()
+        config.freeze()
+        self.cleanup()
+        self.config = config
+        self.setup(config)
+
+    @override(Algorithm)
+    def restore_from_path(
+        self, path: str | Path, *args: Any, component: str | None = None, filesystem: Any = None, **kwargs: Any
+    ) -> None:
+        """Goes on from a checkpoint, in the order of agents that it was made in."""
+        if component is None:
+            files, folder = (filesystem, path) if filesystem else FileSystem.from_uri(str(path))
+            saved = f"{folder}/{self.CLASS_AND_CTOR_ARGS_FILE_NAME}"
+            if files.get_file_info(saved).type == FileType.File:
+                with files.open_input_stream(saved) as file:
+                    team = pickle.load(file)["ctor_args_and_kwargs"][0][0].get("team")
+                self._follow(None if team is None else team.agents)
+        super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
+
     @override(Algorithm)
     def get_state(
         self,
@@ -185,6 +232,7 @@ class JointAlgorithm(Algorithm):
         """RLlib's state, the progress of updates against steps and, if wanted, the replay buffer."""
         state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
         state["progress"] = dict(self._progress)
+        state["agents"] = list(self.config.team.agents)
         stored = self.config.store_buffer_in_checkpoints
         if stored and self._check_component(COMPONENT_REPLAY_BUFFER, components, not_components):
             state[COMPONENT_REPLAY_BUFFER] = self.replay_buffer.get_state()
@@ -193,6 +241,9 @@ class JointAlgorithm(Algorithm):
     @override(Algorithm)
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
+        self._follow(state.get("agents"))
+        if COMPONENT_METRICS_LOGGER in state:  # RLlib reads the runners' step count in it before it restores it
+            self.metrics.set_state(state[COMPONENT_METRICS_LOGGER])
         super().set_state(state)
         if COMPONENT_LEARNER_GROUP in state:
             self._send_weights()

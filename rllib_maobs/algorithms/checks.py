@@ -173,6 +173,11 @@ def inspect_team(config: JointConfig) -> Team:
             )
     finally:
         env.close()
+    decided: Team | None = getattr(config, "team", None)
+    if decided is not None and config.in_evaluation:
+        decided.check(env, f"the evaluation environment {config.env!r}")
+    if decided is not None and set(decided.agents) == set(team.agents):
+        return team.ordered(decided.agents)  # once decided, an order stays
     return team
 
 
