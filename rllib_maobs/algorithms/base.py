@@ -27,7 +27,7 @@ from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
 from rllib_maobs.replay import JointReplayBuffer
-from rllib_maobs.runner import JointEnvRunner, JointSample
+from rllib_maobs.runner import JointSample, raised_as_themselves
 
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many.
@@ -101,19 +101,19 @@ class JointAlgorithm(Algorithm):
             samples: list[JointSample] = self.env_runner.sample(random_actions=random_actions)
             return samples
 
-        def sample_or_error(runner: JointEnvRunner) -> list[JointSample] | ValueError:
-            try:
-                return runner.sample(random_actions=random_actions)
-            except ValueError as error:  # the environment's fault: a restarted runner would meet it again
-                return error
-
-        results = self.env_runner_group.foreach_env_runner(
-            sample_or_error, local_env_runner=False, timeout_seconds=self.config.sample_timeout_s
-        )
-        for result in results:
-            if isinstance(result, ValueError):
-                raise result
+        with raised_as_themselves(self.env_runner_group):
+            results = self.env_runner_group.foreach_env_runner(
+                lambda runner: runner.sample(random_actions=random_actions),
+                local_env_runner=False,
+                timeout_seconds=self.config.sample_timeout_s,
+            )
         return [sample for result in results for sample in result]
+
+    @override(Algorithm)
+    def evaluate(self, parallel_train_future: Any = None) -> Any:
+        """RLlib's evaluation; an error of a remote environment is raised as itself."""
+        with raised_as_themselves(self.eval_env_runner_group):
+            return super().evaluate(parallel_train_future)
 
     def _check_reward(self, sample: JointSample) -> None:
         """Raises a ValueError where agents' rewards differ but the algorithm's value is that of a team reward."""

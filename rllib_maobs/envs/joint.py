@@ -76,6 +76,11 @@ class WithAgentIds:
         """Closes every copy."""
         self._env.close()
 
+    @property
+    def unwrapped(self) -> JointEnv:
+        """The environment without agent ids."""
+        return self._env
+
 
 def register_envs() -> list[str]:
     """Tells Ray the name "maobs/<id>" of every scenario; may be called again, e.g. after `ray.shutdown()`.
@@ -118,6 +123,7 @@ class StackedEnv:
     """Copies of a dict-speaking multi-agent environment, stacked to arrays.
 
     Attributes:
+        envs: The copies.
         observation_layouts: What each agent's observation is made of, None if the environment does not say.
         state_layout: What its `state()` is made of, None if it does not say.
 
@@ -137,7 +143,8 @@ class StackedEnv:
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
                 f"with a fixed team."
             )
-        self._envs = list(envs)
+        self.envs = list(envs)
+        self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._obs: Float | None = None
         # RLlib calls them get_observation_space(agent), PettingZoo observation_space(agent).
@@ -158,14 +165,15 @@ class StackedEnv:
         for copy in range(self.num_envs):
             if mask is not None and not mask[copy]:
                 continue
-            obs, _ = self._envs[copy].reset(seed=None if seed is None else seed[copy])
+            obs, infos = self.envs[copy].reset(seed=None if seed is None else seed[copy])
+            self._infos[copy] = infos or {}
             rows = self._stack(obs, copy)
             if self._obs is None:
                 self._obs = np.zeros((self.num_envs, *rows.shape), dtype=np.float32)
             self._obs[copy] = rows
             self._steps[copy] = 0
         assert self._obs is not None
-        return self._obs.copy(), {}
+        return self._obs.copy(), {"infos": list(self._infos)}
 
     def step(self, actions: Float) -> StepResult:
         """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`."""
@@ -173,13 +181,14 @@ class StackedEnv:
         rewards = np.zeros(actions.shape[:2], dtype=np.float32)
         terminated, truncated = np.zeros((2, self.num_envs), dtype=np.bool_)
         metrics: dict[str, Float] = {}
-        for copy, env in enumerate(self._envs):
+        for copy, env in enumerate(self.envs):
             joint = {
                 agent: self._action(self.action_spaces[agent], action)
                 for agent, action in zip(self.agents, actions[copy], strict=True)
             }
             obs, reward, terminations, truncations, infos = env.step(joint)
             self._steps[copy] += 1
+            self._infos[copy] = infos = infos or {}
             self._obs[copy] = self._stack(obs, copy)
             rewards[copy] = [reward[agent] for agent in self.agents]
             terminated[copy] = self._all(terminations)
@@ -194,7 +203,7 @@ class StackedEnv:
             rewards,
             terminated,
             truncated,
-            {"episode_metrics": metrics} if metrics else {},
+            {"infos": list(self._infos), **({"episode_metrics": metrics} if metrics else {})},
         )
 
     def _all(self, flags: Mapping[str, Any]) -> bool:
@@ -232,13 +241,13 @@ class StackedEnv:
         Raises:
             ValueError: If they have none.
         """
-        if not hasattr(self._envs[0], "state"):
-            raise ValueError(f'{self._envs[0]} has no state(): use critic_state="observations".')
-        return np.stack([np.asarray(env.state(), dtype=np.float32).reshape(-1) for env in self._envs])
+        if not hasattr(self.envs[0], "state"):
+            raise ValueError(f'{self.envs[0]} has no state(): use critic_state="observations".')
+        return np.stack([np.asarray(env.state(), dtype=np.float32).reshape(-1) for env in self.envs])
 
     def close(self) -> None:
         """Closes every copy."""
-        for env in self._envs:
+        for env in self.envs:
             env.close()
 
 
