@@ -133,7 +133,7 @@ def make_policy(env: MAObsParallelEnv, name: str, seed: int = 0) -> Policy:
         for i, agent in enumerate(env.possible_agents):
             env.action_space(agent).seed(seed + i)
         return lambda observations: {agent: env.action_space(agent).sample() for agent in observations}
-    return CheckpointPolicy(env, Path(name))
+    return CheckpointPolicy(env, Path(name).expanduser())
 
 
 class CheckpointPolicy:

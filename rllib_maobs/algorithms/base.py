@@ -26,6 +26,7 @@ from ray.rllib.utils.metrics import (
 from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
+from rllib_maobs.paths import AnyPath
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raised_as_themselves
 
@@ -34,7 +35,7 @@ COMPONENT_REPLAY_BUFFER = "replay_buffer"
 _ROWS_PER_DRAW = 16_384
 
 
-class JointAlgorithm(Algorithm):
+class JointAlgorithm(AnyPath, Algorithm):
     """Off-policy training of a fixed team from joint replay.
 
     Each round samples a fragment of every copy, adds it to replay, and makes the updates that
@@ -70,6 +71,7 @@ class JointAlgorithm(Algorithm):
         for group in (self.env_runner_group, self.eval_env_runner_group):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
+        self._rounds_without_samples = 0
         self._progress = {"env_steps": 0, "updates": 0, "learning_starts": self._steps_before_learning()}
 
     def _steps_before_learning(self) -> int:
@@ -82,7 +84,9 @@ class JointAlgorithm(Algorithm):
         while self._progress["env_steps"] < goal:
             with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
                 samples = self._sample()
+            self._rounds_without_samples = 0 if samples else self._rounds_without_samples + 1
             if not samples:
+                self._check_runners()
                 break  # all runners are down: RLlib restores them before it calls again
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_ADD_DATA_TIMER)):
                 for sample in samples:
@@ -125,6 +129,16 @@ class JointAlgorithm(Algorithm):
             raise ValueError(
                 f"{self.config.name} learns the value of one team reward, but agents' rewards differ at step "
                 f"{sample.start + step} of environment copy {copy}: {sample.rewards[step, copy]}."
+            )
+
+    def _check_runners(self) -> None:
+        """Raises a RuntimeError when RLlib has tried often enough to bring runners back: it would try for ever."""
+        tolerance = self.config.num_consecutive_env_runner_failures_tolerance
+        if self._rounds_without_samples > tolerance:
+            raise RuntimeError(
+                f"No env runner sampled anything in {self._rounds_without_samples} rounds "
+                f"(num_consecutive_env_runner_failures_tolerance={tolerance}): their processes crash, or take longer "
+                f"than sample_timeout_s={self.config.sample_timeout_s:g} s. Ray's logs of them say more."
             )
 
     def _update(self) -> int:

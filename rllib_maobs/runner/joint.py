@@ -184,7 +184,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                         length = math.ceil(num_timesteps / self.num_envs)
                     parts = self._fragment(length, explore, random_actions)
             except Exception as error:
-                self.error = error
+                self.error, self._needs_reset = error, True
                 raise
             samples = [self._joined(part) for part in parts]
             self._callbacks.call("on_sample_end", samples=samples)
