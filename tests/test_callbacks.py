@@ -236,27 +236,6 @@ def test_stock_episode_metrics_callback_changes_nothing(ray_session: None) -> No
     assert metrics(small_config("maddpg", horizon=5).callbacks(maobs.EpisodeMetricsCallback)) == pytest.approx(plain)
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        (
-            {"env_to_module_connector": lambda *a, **k: None},
-            r"env_to_module_connector must .*normalize_observations=True",
-        ),
-        ({"module_to_env_connector": lambda *a, **k: None}, r"module_to_env_connector must .*exploration=\.\.\."),
-        ({"observation_filter": "MeanStdFilter"}, r"observation_filter must not be set: .*normalize_observations=True"),
-        ({"learner_connector": lambda *a, **k: None}, r"learner_connector must not be set: .*n_step"),
-        ({"output": "/tmp/x"}, r"output must not be set: what is sampled are joint columns, .*on_sample_end"),
-    ],
-)
-def test_what_works_on_episodes_is_refused_with_what_there_is_instead(setting: dict[str, Any], message: str) -> None:
-    config = small_config("maddpg")
-    methods = {"output": config.offline_data, "learner_connector": config.training}
-    methods.get(next(iter(setting)), config.env_runners)(**setting)
-    with pytest.raises(ValueError, match=message):
-        config.validate()
-
-
 def test_a_dict_environment_is_what_callbacks_get(ray_session: None) -> None:
     """Behind agent ids, too."""
     found: list[Any] = []

@@ -43,6 +43,10 @@ class Faulty(Lamp):
                 result[0]["right"][1] = np.nan
         return result
 
+    def close(self) -> None:
+        if self.t == self.config.get("at", 3) and self.config.get("what", "key") == "key":
+            raise RuntimeError("no lidar to close")
+
     def _fail(self) -> None:
         what = self.config.get("what", "key")
         if what == "crash":

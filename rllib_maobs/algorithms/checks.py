@@ -22,27 +22,6 @@ if TYPE_CHECKING:
 
 _CRITICS_SEE = (), ("observation", "action"), ("state", "action"), ("state", "joint_action")
 # What a policy's own RLModuleSpec may set.
-_OBSERVATIONS = (
-    "normalised observations are training(normalize_observations=True), the last T of them together are what a "
-    "recurrent actor sees (training(actor='lstm', seq_length=T)); any other function of observations goes into the "
-    "environment, or into an actor of your own (docs/your_own.md)"
-)
-# Settings of RLlib for what lies between its episodes and its batches: each with its value if it is not set, and what
-# there is instead.
-_INSTEAD = {
-    "_env_to_module_connector": (None, _OBSERVATIONS),
-    "_module_to_env_connector": (
-        None,
-        "exploration is training(exploration=...), any other function of actions goes into the environment",
-    ),
-    "_learner_connector": (
-        None,
-        "training() has n_step, reward_scale and normalize_observations; losses of your own are a learner of your own "
-        "(docs/your_own.md)",
-    ),
-    "observation_filter": ("NoFilter", _OBSERVATIONS),
-    "output": (None, "a callback on_sample_end gets all that is sampled, and can write it (docs/callbacks.md)"),
-}
 _OF_A_POLICY = (*COMMON_SETTINGS, "actor", "actor_settings", "critic", "critic_settings")
 
 
@@ -83,12 +62,6 @@ def check_settings_of(config: JointConfig) -> None:
         )
     if not issubclass(config.env_runner_cls or object, JointEnvRunner):
         raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {config.env_runner_cls}: replay is joint.")
-    for name, (unset, instead) in _INSTEAD.items():
-        if getattr(config, name) != unset:
-            raise ValueError(
-                f"{name.removeprefix('_')} must not be set: what is sampled are joint columns, which pass neither "
-                f"connectors nor writers; {instead}."
-            )
     if not config.normalize_actions:
         raise ValueError("normalize_actions must be True: the actors' actions are in [-1, 1].")
 

@@ -78,8 +78,9 @@ class WithAgentIds:
 
     @property
     def unwrapped(self) -> JointEnv:
-        """The environment without agent ids."""
-        return self._env
+        """The environment without what is put around it."""
+        inner: JointEnv = getattr(self._env, "unwrapped", self._env)
+        return inner
 
 
 def register_envs() -> list[str]:

@@ -11,7 +11,7 @@ from ray import cloudpickle
 from ray.exceptions import RayTaskError
 
 # How long a runner may take to say what went wrong; one whose process has crashed says nothing.
-_ANSWER_S = 10.0
+_ANSWER_S = 3.0
 
 
 class EnvError(Exception):

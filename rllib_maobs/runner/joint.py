@@ -119,7 +119,10 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     def make_env(self) -> None:
         """Makes the E copies anew; they are reset at the next `sample()`."""
         if self.env is not None:
-            self.env.close()
+            try:
+                self.env.close()
+            except Exception as error:  # it may be closed because it is broken
+                logger.warning("The environment of runner %s could not be closed: %r", self.worker_index, error)
         self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
         self._obs, self._needs_reset = None, True
         self._callbacks.on_environment_created()
