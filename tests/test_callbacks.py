@@ -182,6 +182,7 @@ def test_a_restored_runner_goes_on_with_its_episodes(ray_session: None) -> None:
     assert lengths == [5, 5]
     # Episodes of which the beginning is not known are not shown in part.
     state["sampling"]["watched"] = None
+    third.sample(num_timesteps=2)
     third.set_state(state)
     third.sample(num_timesteps=2 * 7)
     assert lengths == [5, 5, 5, 5]

@@ -93,7 +93,6 @@ class EpisodeWatcher:
                 observation_space=dict(zip(team.agents, team.observation_spaces, strict=True)),
                 action_space=dict(zip(team.agents, team.action_spaces, strict=True)),
                 agent_module_ids=dict(zip(team.agents, self._runner.module_ids, strict=True)),
-                agent_to_module_mapping_fn=self._runner.config.policy_mapping_fn,
             )
             self._call("on_episode_created", copy)
 
