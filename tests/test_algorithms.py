@@ -167,14 +167,6 @@ def test_remote_runners_sample_learn_and_survive_a_kill(ray_session: None) -> No
     algo.stop()
 
 
-def test_a_remote_environments_error_is_raised_not_retried(ray_session: None) -> None:
-    config = small_config("iddpg").environment(TwoAgents, env_config={"nan_at": 3}).env_runners(num_env_runners=1)
-    algo = config.build_algo()
-    with pytest.raises(ValueError, match="observation of agent 'right' is not finite at step 3"):
-        algo.train()
-    algo.stop()
-
-
 def test_a_foreign_parallel_env_is_trained(ray_session: None) -> None:
     tune.register_env("mpe2_spread", lambda _: simple_spread_v3.parallel_env(continuous_actions=True, max_cycles=8))
     config = small_config("maddpg-l").environment("mpe2_spread").training(critic_state="world")

@@ -7,10 +7,11 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "rllib_maobs"
 # What each part may import of the others; whatever is not listed may import nothing of them.
-FOUNDATION = {"layout", "options", "registry"}
+FOUNDATION = {"layout", "options", "paths", "registry"}
 ALLOWED = {
     "layout": set(),
     "options": set(),
+    "paths": set(),
     "registry": {"options"},
     "envs": FOUNDATION,
     "modules": FOUNDATION,

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -27,8 +28,10 @@ from ray.rllib.algorithms import Algorithm
 import rllib_maobs as maobs
 from rllib_maobs.envs import make_vec
 from rllib_maobs.experiment import Experiment, decayed, fading, load_curves, plot_curves, summarise
+from rllib_maobs.experiment import claim as claim_module
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
+from rllib_maobs.experiment.claim import LOCK, claim
 from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import STEPS, best_trial, to_markdown
@@ -390,6 +393,60 @@ def test_resume_takes_the_settings_of_the_original_run(used: Path, capsys: pytes
     with pytest.raises(SystemExit):
         resume("another")
     assert "holds a run of demo, not of another" in capsys.readouterr().err
+
+
+# Holds a folder for as long as it lives; without the package, which takes seconds to import.
+HOLDER = f"""
+import runpy, sys, time
+from pathlib import Path
+file = runpy.run_path({claim_module.__file__!r})["claim"](Path(sys.argv[1]))
+print("claimed", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_folder_is_claimed_by_one_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Until it ends, however it does."""
+    folder = tmp_path / "new"
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True) as holder:
+        try:
+            assert holder.stdout is not None and holder.stdout.readline() == "claimed\n"
+            with pytest.raises(SystemExit) as end:
+                EXPERIMENT.main(["--results-dir", str(folder)])
+        finally:
+            holder.kill()
+    assert end.value.code == 2 and [path.name for path in folder.iterdir()] == [LOCK]
+    said = capsys.readouterr().err
+    assert f"new is in use by another run (process {holder.pid} on " in said and "or choose another --resu" in said
+    with claim(folder):
+        assert parsed(EXPERIMENT, "--results-dir", str(folder)).results_dir == folder  # as if it were not there
+        with pytest.raises(ValueError, match=f"process {os.getpid()} on "):
+            claim(folder)
+    claim(folder).close()
+
+
+def test_a_folder_that_cannot_be_written_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as end:
+        EXPERIMENT.main(["--results-dir", str(tmp_path / "file" / "new")])
+    assert end.value.code == 2
+    assert "new cannot be written (Not a directory): choose a folder that can" in capsys.readouterr().err
+
+    def refuse(*args: Any, **kwargs: Any) -> Any:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)  # these tests may run as root, who may write everywhere
+    with pytest.raises(ValueError, match=r"cannot be written \(Permission denied\)"):
+        claim(tmp_path)
+
+
+def test_results_go_where_the_path_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    for given, folder in (("~/a b/", "home/a b"), ("./[ü]/../x/", "x"), (str(tmp_path / "y") + "/", "y")):
+        assert parsed(EXPERIMENT, "--results-dir", given).results_dir == tmp_path / folder
 
 
 ROWS = Experiment(
@@ -766,16 +823,18 @@ def died_while_saving(results: Path, algorithm: str) -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     """A quick run, in which a trial's process is killed and which is then interrupted; and then resumed."""
     folder = tmp_path_factory.mktemp("run")
-    results = folder / "results"
+    results = folder / "the [first] results, größer #1 100%"
     script = folder / "small.py"
     script.write_text(SCRIPT)
-    command = [sys.executable, str(script), "--results-dir", str(results)]
+    command = [sys.executable, str(script), "--results-dir", f"./{results.name}/"]
     # Tune copies results to the folder with each checkpoint; with one an iteration the first trial is killed early, and
     # has checkpoints to write after it is resumed: there a decision that is not forgotten would stop it.
     first = [*command, "--quick", "--checkpoint-freq", "1"]
     with subprocess.Popen(first, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             killed = wait_for(lambda: read_results(results / TRIALS[0])[1:], process)
+            with pytest.raises(ValueError, match=f"is in use by another run .process {process.pid} on "):
+                claim(results)
             os.kill(killed[0]["pid"], signal.SIGKILL)
             wait_for((results / TRIALS[0] / "error.txt").exists, process)
             process.send_signal(signal.SIGINT)
@@ -795,13 +854,13 @@ def test_the_plan_is_printed_first(run: SimpleNamespace) -> None:
     assert table
     assert "small: 3 trials, iddpg, entity, maddpg-l with seed 0\n--quick trains iddpg and entity and maddpg-l" in plan
     assert ["entity", "1,600", "0.125"] in [line.split() for line in plan.splitlines()]
-    assert f"TensorBoard: tensorboard --logdir {run.results}" in plan
+    assert f"TensorBoard: tensorboard --logdir {shlex.quote(str(run.results))}\n" in plan
 
 
 def test_a_failed_trial_and_an_interruption_are_reported(run: SimpleNamespace) -> None:
     assert run.code == 130, run.output
     assert f"FAILED: iddpg-seed0, see {run.results / 'iddpg-seed0' / 'error.txt'}" in run.output
-    assert f"--resume --results-dir {run.results}" in run.output
+    assert f"--resume --results-dir {shlex.quote(str(run.results))}\n" in run.output
 
 
 def test_a_resumed_run_goes_on_where_it_was(run: SimpleNamespace) -> None:

@@ -36,15 +36,16 @@ from rllib_maobs.algorithms.checks import check_machine
 from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
+from rllib_maobs.paths import AnyPath, absolute
 from rllib_maobs.replay import JointReplayBuffer
-from rllib_maobs.runner import JointEnvRunner, JointSample
+from rllib_maobs.runner import JointSample, raised_as_themselves
 
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many.
 _ROWS_PER_DRAW = 16_384
 
 
-class JointAlgorithm(Algorithm):
+class JointAlgorithm(AnyPath, Algorithm):
     """Off-policy training of a fixed team from joint replay.
 
     Each round samples a fragment of every copy, adds it to replay, and makes the updates that
@@ -86,6 +87,7 @@ class JointAlgorithm(Algorithm):
         for group in (self.env_runner_group, self.eval_env_runner_group):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
+        self._rounds_without_samples = 0
         self._progress = {"env_steps": 0, "updates": 0, "learning_starts": self._steps_before_learning()}
 
     def _steps_before_learning(self) -> int:
@@ -98,7 +100,9 @@ class JointAlgorithm(Algorithm):
         while self._progress["env_steps"] < goal:
             with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
                 samples = self._sample()
+            self._rounds_without_samples = 0 if samples else self._rounds_without_samples + 1
             if not samples:
+                self._check_runners()
                 break  # all runners are down: RLlib restores them before it calls again
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_ADD_DATA_TIMER)):
                 for sample in samples:
@@ -117,19 +121,19 @@ class JointAlgorithm(Algorithm):
             samples: list[JointSample] = self.env_runner.sample(random_actions=random_actions)
             return samples
 
-        def sample_or_error(runner: JointEnvRunner) -> list[JointSample] | ValueError:
-            try:
-                return runner.sample(random_actions=random_actions)
-            except ValueError as error:  # the environment's fault: a restarted runner would meet it again
-                return error
-
-        results = self.env_runner_group.foreach_env_runner(
-            sample_or_error, local_env_runner=False, timeout_seconds=self.config.sample_timeout_s
-        )
-        for result in results:
-            if isinstance(result, ValueError):
-                raise result
+        with raised_as_themselves(self.env_runner_group):
+            results = self.env_runner_group.foreach_env_runner(
+                lambda runner: runner.sample(random_actions=random_actions),
+                local_env_runner=False,
+                timeout_seconds=self.config.sample_timeout_s,
+            )
         return [sample for result in results for sample in result]
+
+    @override(Algorithm)
+    def evaluate(self, parallel_train_future: Any = None) -> Any:
+        """RLlib's evaluation; an error of a remote environment is raised as itself."""
+        with raised_as_themselves(self.eval_env_runner_group):
+            return super().evaluate(parallel_train_future)
 
     def _check_reward(self, sample: JointSample) -> None:
         """Raises a ValueError where agents' rewards differ but the algorithm's value is that of a team reward."""
@@ -141,6 +145,16 @@ class JointAlgorithm(Algorithm):
             raise ValueError(
                 f"{self.config.name} learns the value of one team reward, but agents' rewards differ at step "
                 f"{sample.start + step} of environment copy {copy}: {sample.rewards[step, copy]}."
+            )
+
+    def _check_runners(self) -> None:
+        """Raises a RuntimeError when RLlib has tried often enough to bring runners back: it would try for ever."""
+        tolerance = self.config.num_consecutive_env_runner_failures_tolerance
+        if self._rounds_without_samples > tolerance:
+            raise RuntimeError(
+                f"No env runner sampled anything in {self._rounds_without_samples} rounds "
+                f"(num_consecutive_env_runner_failures_tolerance={tolerance}): their processes crash, or take longer "
+                f"than sample_timeout_s={self.config.sample_timeout_s:g} s. Ray's logs of them say more."
             )
 
     def _update(self) -> int:
@@ -213,13 +227,14 @@ class JointAlgorithm(Algorithm):
     ) -> None:
         """Goes on from a checkpoint, in the order of agents that it was made in."""
         if component is None:
-            files, folder = (filesystem, path) if filesystem else FileSystem.from_uri(str(path))
+            files, folder = (filesystem, path) if filesystem else FileSystem.from_uri(absolute(path))
             saved = f"{folder}/{self.CLASS_AND_CTOR_ARGS_FILE_NAME}"
             if files.get_file_info(saved).type == FileType.File:
                 with files.open_input_stream(saved) as file:
                     team = pickle.load(file)["ctor_args_and_kwargs"][0][0].get("team")
                 self._follow(None if team is None else team.agents)
         super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
+        self._send_weights()
 
     @override(Algorithm)
     def get_state(
@@ -254,12 +269,6 @@ class JointAlgorithm(Algorithm):
         if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
             starts = self._progress["env_steps"] + self._steps_before_learning()
             self._progress |= {"learning_starts": starts, "updates": 0}
-
-    @override(Algorithm)
-    def restore_from_path(self, path: Any, *args: Any, **kwargs: Any) -> None:
-        """Goes on from a checkpoint, or from one of its components."""
-        super().restore_from_path(path, *args, **kwargs)
-        self._send_weights()
 
     def _send_weights(self) -> None:
         """Sends all remote runners the weights; RLlib would not to those to which others are still on their way."""

@@ -116,6 +116,12 @@ class WithAgentIds:
         """Closes every copy."""
         self._env.close()
 
+    @property
+    def unwrapped(self) -> JointEnv:
+        """The environment without what is put around it."""
+        inner: JointEnv = getattr(self._env, "unwrapped", self._env)
+        return inner
+
 
 def register_envs() -> list[str]:
     """Tells Ray the name "maobs/<id>" of every scenario; may be called again, e.g. after `ray.shutdown()`.
@@ -203,6 +209,7 @@ class StackedEnv:
     without any flag were truncated then.
 
     Attributes:
+        envs: The copies.
         observation_layouts: What each agent's observation is made of, None if the environment does not say.
         state_layout: What its `state()` is made of, None if it does not say.
 
@@ -238,7 +245,8 @@ class StackedEnv:
                     f"The agents of {self._name} are {self.agents} in copy 0, but {theirs} in copy {copy}: legal is "
                     f"the same set of agents in all copies."
                 )
-        self._envs = list(envs)
+        self.envs = list(envs)
+        self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._listed = np.zeros(self.num_envs, dtype=np.bool_)  # which ones say in `agents` who is there
         self._obs: Float | None = None
@@ -266,16 +274,17 @@ class StackedEnv:
             if mask is not None and not mask[copy]:
                 continue
             self._steps[copy] = 0
-            result = self._envs[copy].reset(seed=None if seed is None else seed[copy])
+            result = self.envs[copy].reset(seed=None if seed is None else seed[copy])
             if not _are(result, (Mapping, Mapping | None)):
                 raise self._error(copy, f"reset() returns {_kinds(result)}", "two dicts by agent: observations, infos")
+            self._infos[copy] = result[1] or {}
             rows = self._stack(result[0], copy)
             if self._obs is None:
                 self._obs = np.zeros((self.num_envs, *rows.shape), dtype=np.float32)
             self._obs[copy] = rows
-            self._listed[copy] = bool(getattr(self._envs[copy], "agents", None))
+            self._listed[copy] = bool(getattr(self.envs[copy], "agents", None))
         assert self._obs is not None
-        return self._obs.copy(), {}
+        return self._obs.copy(), {"infos": list(self._infos)}
 
     def step(self, actions: Float) -> StepResult:
         """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`.
@@ -292,7 +301,7 @@ class StackedEnv:
         terminated = np.zeros(actions.shape[:2], dtype=np.bool_)
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         metrics: dict[str, Float] = {}
-        for copy, env in enumerate(self._envs):
+        for copy, env in enumerate(self.envs):
             joint = {
                 agent: self._action(self.action_spaces[agent], action)
                 for agent, action in zip(self.agents, actions[copy], strict=True)
@@ -303,13 +312,14 @@ class StackedEnv:
                 legal = "five dicts by agent: observations, rewards, terminated, truncated, infos"
                 raise self._error(copy, f"step() returns {_kinds(result)}", legal)
             obs, reward, terminations, truncations, infos = result
+            self._infos[copy] = infos = infos or {}
             self._obs[copy] = self._stack(obs, copy)
             rewards[copy] = self._rewards(reward, copy)
             over = self._flags(terminations, truncations, copy)
             if over is not None:
                 terminated[copy] = over
                 truncated[copy] = not over.all()
-                info = (infos or {}).get(self.agents[0]) or {}  # None is taken as empty: it says nothing
+                info = infos.get(self.agents[0]) or {}  # None is taken as empty: it says nothing
                 for name, value in info.get("episode_metrics", {}).items():
                     metrics.setdefault(name, np.full(self.num_envs, np.nan, dtype=np.float32))[copy] = value
         return (
@@ -317,7 +327,7 @@ class StackedEnv:
             rewards,
             terminated,
             truncated,
-            {"episode_metrics": metrics} if metrics else {},
+            {"infos": list(self._infos), **({"episode_metrics": metrics} if metrics else {})},
         )
 
     def _error(self, copy: int, what: str, legal: str) -> ValueError:
@@ -330,7 +340,7 @@ class StackedEnv:
             np.array([bool(flags.get(agent)) for agent in self.agents]) for flags in (terminations, truncations)
         )
         ended, everybody = terminated | truncated, bool(terminations.get("__all__"))
-        emptied = self._listed[copy] and not self._envs[copy].agents
+        emptied = self._listed[copy] and not self.envs[copy].agents
         if ended.all() or everybody or truncations.get("__all__") or emptied:
             return terminated | (everybody & ~truncated)
         if ended.any():
@@ -387,7 +397,7 @@ class StackedEnv:
             ValueError: If they have none, or it changes its size or is not finite; names copy and step.
         """
         rows: list[Float] = []
-        for copy, env in enumerate(self._envs):
+        for copy, env in enumerate(self.envs):
             try:
                 row = np.asarray(env.state(), dtype=np.float32).reshape(-1)
             except (AttributeError, NotImplementedError) as error:
@@ -405,7 +415,7 @@ class StackedEnv:
 
     def close(self) -> None:
         """Closes every copy."""
-        for env in self._envs:
+        for env in self.envs:
             _stepped.pop(id(_innermost(env)), None)
             env.close()
 

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from rllib_maobs.experiment.claim import LOCK
 from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
 
 _FILE = "experiment.json"
-_BEFORE_START = (_FILE, "tuner.pkl")  # What is written before the first trial starts.
+_BEFORE_START = (_FILE, "tuner.pkl", LOCK)  # What is written before the first trial starts.
 # What --quick changes; a flag that is given still wins.
 QUICK = {"seeds": [0], "checkpoint_freq": 2}
 # What decides the results: a resumed run must have the same.
@@ -182,7 +183,8 @@ def parse(
     if args.address and args.workers != parser.get_default("workers"):
         parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
 
-    results_dir = (args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)).resolve()
+    results_dir = args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)
+    results_dir = results_dir.expanduser().resolve()
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
     if args.resume:

@@ -1,15 +1,27 @@
 """What a resumed run needs done to Tune's saved state, which Tune itself does not do."""
 
+import glob
 import json
 import warnings
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray.rllib.utils.annotations import override
+from ray.tune.search.basic_variant import BasicVariantGenerator
 
 TESTED_RAY = (2, 60)
 """The release of Ray, any patch of it, whose saved state this was tried with: the range in `pyproject.toml`."""
 _DECISIONS = "_cached_trial_decisions"
+
+
+class Grid(BasicVariantGenerator):
+    """Tune's own way through a grid of trials, which finds its state again in a folder with brackets in its name."""
+
+    @override(BasicVariantGenerator)
+    def restore_from_dir(self, dirpath: str) -> None:
+        """Go on from the newest state in a folder; Tune takes the folder's name for a pattern."""
+        super().restore_from_dir(glob.escape(dirpath))
 
 
 def forget_decisions(results_dir: Path) -> None:

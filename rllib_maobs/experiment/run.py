@@ -22,10 +22,11 @@ from rllib_maobs.algorithms.settings import without_effect
 from rllib_maobs.checkpoints import saved_networks
 from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
 from rllib_maobs.experiment.baselines import play_baselines
+from rllib_maobs.experiment.claim import claim
 from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
-from rllib_maobs.experiment.resume import forget_decisions
+from rllib_maobs.experiment.resume import Grid, forget_decisions
 from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
@@ -131,7 +132,12 @@ class Experiment:
         except ValueError as error:
             parser.error(str(error))
         try:
-            code = self._run(args, specs)
+            claimed = claim(args.results_dir)
+        except ValueError as error:
+            parser.error(str(error))
+        try:
+            with claimed:
+                code = self._run(args, specs)
         except KeyboardInterrupt:  # While trials run, Tune takes the first one: it saves its state and returns.
             print("\nInterrupted.", f"Go on with: {_resume_command(args)}" if has_started(args.results_dir) else "")
             code = 130
@@ -322,7 +328,9 @@ def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tune
     return tune.Tuner(
         Trial,
         param_space=tune.grid_search([asdict(spec) for spec in specs]),
-        tune_config=tune.TuneConfig(trial_name_creator=_trial_name, trial_dirname_creator=_trial_name),
+        tune_config=tune.TuneConfig(
+            search_alg=Grid(), trial_name_creator=_trial_name, trial_dirname_creator=_trial_name
+        ),
         run_config=tune.RunConfig(
             name=args.results_dir.name,
             storage_path=str(args.results_dir.parent),

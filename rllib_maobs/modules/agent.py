@@ -22,6 +22,7 @@ from rllib_maobs.modules.actors import ACTORS, Actor, RecurrentActor, unrolled
 from rllib_maobs.modules.critics import CRITICS, Critic
 from rllib_maobs.modules.exploration import Exploration, make_exploration
 from rllib_maobs.modules.normalizer import Normalizer
+from rllib_maobs.paths import AnyPath
 from rllib_maobs.registry import check_settings, settings_of
 
 # What RLlib's model_config calls settings that networks of several kinds take.
@@ -90,7 +91,7 @@ def takes(cls: type[Any], name: str, reserved: Collection[str] = ()) -> bool:
     return own in parameters or (anything and own == name)
 
 
-class AgentModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
+class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     """Actor, critic and their target networks of one agent.
 
     Lift a trained agent out of an algorithm's checkpoint and act with it:

@@ -6,7 +6,7 @@ import logging
 import math
 import pickle
 import uuid
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
 from ray.rllib.env import INPUT_ENV_SPACES
+from ray.rllib.env.env_errors import StepFailedRecreateEnvError
 from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
@@ -35,11 +36,15 @@ from rllib_maobs.envs.team import JointEnv, Team, finished
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
 from rllib_maobs.runner.acting import Acting
+from rllib_maobs.runner.callbacks import Callbacks
 from rllib_maobs.runner.episodes import EPISODE_METRICS, Episodes
+from rllib_maobs.runner.errors import EnvError, portable
 from rllib_maobs.runner.making import make_env
 
 logger = logging.getLogger(__name__)
 COMPONENT_SAMPLING = "sampling"
+# Its number, the row of every column, and what there was at the end of the episodes that ended.
+_Step = tuple[int, dict[str, Any], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -74,18 +79,27 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     All agents of all copies act in one stacked forward pass, and what comes back are arrays `(L, E, N, ...)`.
     Set by the algorithms of this package as `env_runner_cls`; `sample()` and `get_metrics()` keep RLlib's
     signatures and result keys, so RLlib's evaluation, fault tolerance and Tune work with it unchanged.
-    RLlib's `on_episode_*` callbacks are not called: there are no episode objects to hand to them.
+    RLlib's callbacks are called as RLlib calls them; `on_sample_end` gets the joint samples, and episode objects exist
+    only where a callback looks at them.
+
+    Attributes:
+        error: The error of the environment that ended the last `sample()`, if one did.
     """
 
     @override(EnvRunner)
     def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
         self.team: Team = self.config.team
+        self.error: Exception | None = None
+        self._failures = self._restarts = 0  # of the environment: since an episode could be sampled, and ever
         self.module_ids: tuple[str, ...] = self.config.module_ids
         self.env: JointEnv | None = None
         self.num_envs: int = self.config.num_envs_per_env_runner
         self._generator = torch.Generator()
         self._seed_anew()
+        self._callbacks = Callbacks(self)
+        self._obs: NDArray[np.float32] | None = None
+        self._needs_reset = True
         if self.worker_index is None or self.worker_index > 0 or self.num_workers == 0:
             self.make_env()
         elif self.config.create_env_on_local_worker:
@@ -94,8 +108,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._weights_seq_no = 0
         self.make_module()
 
-        self._obs: NDArray[np.float32] | None = None
-        self._needs_reset = True
+        self._watcher = self._callbacks.watcher()
         self._episodes = Episodes(self.team.agents, self.module_ids, self.num_envs)
         self._steps_sampled = 0
         self._source = f"{self.worker_index}-{uuid.uuid4().hex}"
@@ -112,9 +125,13 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     def make_env(self) -> None:
         """Makes the E copies anew; they are reset at the next `sample()`."""
         if self.env is not None:
-            self.env.close()
+            try:
+                self.env.close()
+            except Exception as error:  # it may be closed because it is broken
+                logger.warning("The environment of runner %s could not be closed: %r", self.worker_index, error)
         self.env = make_env(self.config, self.num_envs, self.worker_index or 0, self.team)
-        self._needs_reset = True
+        self._obs, self._needs_reset = None, True
+        self._callbacks.on_environment_created()
 
     @override(EnvRunner)
     def make_module(self) -> None:
@@ -155,6 +172,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
         Raises:
             ValueError: If an observation or reward is not finite; names the agent, copy and step.
+            Exception: Whatever the environment raises, if RLlib's settings of fault tolerance do not let it be made
+                anew (any more).
         """
         if self.env is None:
             raise ValueError(f"{self} has no environment, so it cannot sample.")
@@ -162,46 +181,111 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             raise ValueError("Give either num_timesteps or num_episodes, not both.")
         if num_timesteps == 0 or num_episodes == 0:
             return []  # an evaluation has less to play than it has runners
+        self.error = None
         explore = self.config.explore if explore is None else explore
         with self.metrics.log_time(SAMPLE_TIMER):
-            if force_reset or num_episodes is not None or self._needs_reset:
-                self._reset_all()
-            start = self._steps_sampled
-            if num_episodes is not None:
-                steps = self._play(num_episodes, explore, random_actions)
+            if force_reset or num_episodes is not None:
                 self._needs_reset = True
-            else:
-                length = self.config.get_rollout_fragment_length(self.worker_index)
-                if num_timesteps is not None:
-                    length = math.ceil(num_timesteps / self.num_envs)
-                steps = [self._step(explore, random_actions) for _ in range(length)]
-        rows, finals = zip(*steps, strict=True)
+            try:
+                if num_episodes is not None:
+                    parts = self._play(num_episodes, explore, random_actions)
+                else:
+                    length = self.config.get_rollout_fragment_length(self.worker_index)
+                    if num_timesteps is not None:
+                        length = math.ceil(num_timesteps / self.num_envs)
+                    parts = self._fragment(length, explore, random_actions)
+            except Exception as error:
+                self.error, self._needs_reset = error, True
+                raise
+            samples = [self._joined(part) for part in parts]
+            self._callbacks.call("on_sample_end", samples=samples)
+        return samples
+
+    def _joined(self, steps: list[_Step]) -> JointSample:
+        """Steps that follow one another as columns."""
+        starts, rows, finals = zip(*steps, strict=True)
         columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         final_columns = {f"final_{name}": np.concatenate([final[name] for final in finals]) for name in finals[0]}
-        return [JointSample(**columns, **final_columns, source=self._source, start=start)]
+        return JointSample(**columns, **final_columns, source=self._source, start=starts[0])
 
     def _reset_all(self) -> None:
-        assert self.env is not None
-        # Copies are seeded once; after that each goes on in its own stream.
-        seeds = self._env_seeds if self._obs is None else None
-        self._obs, _ = self.env.reset(seed=seeds)
-        self._check_finite("observation", self._obs)
         everyone = np.ones(self.num_envs, dtype=np.bool_)
+        # Copies are seeded once; after that each goes on in its own stream. Those made anew get other streams.
+        seeds = [(seed + self._restarts) % 2**32 for seed in self._env_seeds] if self._obs is None else None
+        self._obs = self._reset(everyone, seed=seeds)
         self._episodes.begin(everyone)
         self.acting.forget(everyone)
         self._needs_reset = False
         self._steps_sampled += 1  # a gap: what follows is not linked to what was sampled before
 
-    def _play(self, num_episodes: int, explore: bool, random_actions: bool) -> list[Any]:
-        """Plays episodes: copy e plays its share of them; further ones of it are not counted."""
+    def _fragment(self, length: int, explore: bool, random_actions: bool) -> list[list[_Step]]:
+        """Steps all copies so often; what came before an error of the environment is dropped, as RLlib does."""
+        parts: list[list[_Step]] = [[]]
+        while len(parts[-1]) < length:
+            self._advance(parts, explore, random_actions)
+        if self._failures and any(len(final["obs"]) for _, _, final in parts[-1]):
+            self._failures = 0
+        return parts[-1:] if length else []
+
+    def _play(self, num_episodes: int, explore: bool, random_actions: bool) -> list[list[_Step]]:
+        """Plays episodes: copy e plays its share of them; further ones of it are not counted.
+
+        Returns:
+            The steps in parts, between which the environment was made anew.
+        """
         left = np.full(self.num_envs, num_episodes // self.num_envs)
         left[: num_episodes % self.num_envs] += 1
-        steps = []
+        parts: list[list[_Step]] = [[]]
         while (left > 0).any():
-            row, final = self._step(explore, random_actions, counted=left > 0)
-            steps.append((row, final))
-            left -= finished(row["terminated"], row["truncated"])
-        return steps
+            if self._advance(parts, explore, random_actions, counted=left > 0):
+                _, row, _ = parts[-1][-1]
+                ended = finished(row["terminated"], row["truncated"])
+                if (ended & (left > 0)).any():
+                    self._failures = 0
+                left -= ended
+        self._needs_reset = True
+        return [part for part in parts if part]
+
+    def _advance(
+        self, parts: list[list[_Step]], explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None
+    ) -> bool:
+        """Adds one step to the last part; after an error of the environment it begins a part instead.
+
+        Returns:
+            Whether it was a step.
+        """
+        try:
+            if self._needs_reset:
+                self._reset_all()
+            start = self._steps_sampled
+            parts[-1].append((start, *self._step(explore, random_actions, counted)))
+            return True
+        except EnvError as error:
+            assert isinstance(error.__cause__, Exception)
+            self._make_env_anew(error.__cause__)
+            parts.append([])
+            return False
+
+    def _make_env_anew(self, error: Exception) -> None:
+        """Makes the environment anew after an error of its own, or raises it if RLlib's settings do not allow that."""
+        config = self.config
+        self._failures += 1
+        self._restarts += 1
+        # A remote runner is not restarted for it: its process is sound. An illegal value would come again.
+        runners = config.restart_failed_env_runners and bool(self.worker_index) and not isinstance(error, ValueError)
+        limit = min(config.num_consecutive_env_runner_failures_tolerance, config.max_num_env_runner_restarts)
+        if not (config.restart_failed_sub_environments or runners) or self._failures > limit:
+            raise error from error.__cause__
+        if not isinstance(error, StepFailedRecreateEnvError):
+            logger.warning(
+                "The environment of runner %s raised %r and is made anew (failure %d since an episode could be "
+                "sampled, %d are tolerated).",
+                self.worker_index,
+                error,
+                self._failures,
+                limit,
+            )
+        self.make_env()
 
     def _step(
         self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None
@@ -212,12 +296,17 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             The row of every column `(E, ...)`, and what there was at the end of the episodes that ended `(D, ...)`.
         """
         assert self.env is not None and self._obs is not None
+        if self._watcher is not None:
+            self._watcher.start(counted)
         row = self._sight()
         with self.metrics.log_time(RLMODULE_INFERENCE_TIMER):
             t = self.num_env_steps_sampled_lifetime
             row["actions"] = self.acting(self._obs, t, explore=explore, random=random_actions)
         played = self.acting.to_env(row["actions"])
-        self._obs, row["rewards"], terminated, row["truncated"], info = self.env.step(played)
+        try:
+            self._obs, row["rewards"], terminated, row["truncated"], info = self.env.step(played)
+        except Exception as error:
+            raise EnvError from error
         done = finished(terminated, row["truncated"])
         row["terminated"] = (
             terminated if terminated.ndim == 2 else terminated[:, None].repeat(row["rewards"].shape[1], 1)
@@ -227,15 +316,30 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._check_finite("reward", row["rewards"])
         self._steps_sampled += 1
         self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
+        if self._watcher is not None:
+            self._watcher.step(row, self._obs, done, info, counted)
         if not done.any():
             return row, {name: row[name][:0] for name in ("obs", "state", "recurrent_state") if name in row}
         final = {name: values[done] for name, values in self._sight().items()}
         self._episodes.finish(done if counted is None else done & counted, info.get(EPISODE_METRICS, {}))
         self._episodes.begin(done)
         self.acting.forget(done)
-        self._obs, _ = self.env.reset(mask=done)
-        self._check_finite("observation", self._obs)
+        self._obs = self._reset(done, mask=done)
         return row, final
+
+    def _reset(self, copies: NDArray[np.bool_], **how: Any) -> NDArray[np.float32]:
+        """Resets the copies `(E,)`; returns all observations `(E, N, O)`."""
+        assert self.env is not None
+        if self._watcher is not None and "mask" not in how:  # at the end of an episode it has created the next one
+            self._watcher.create(copies)
+        try:
+            obs, info = self.env.reset(**how)
+        except Exception as error:
+            raise EnvError from error
+        self._check_finite("observation", obs)
+        if self._watcher is not None:
+            self._watcher.reset(copies, obs, info)
+        return obs
 
     def _sight(self) -> dict[str, Any]:
         """What there is to see and to remember now: observations, and where they are stored states."""
@@ -256,6 +360,27 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             f"of its episode in environment copy {copy} of {self.config.env} (runner {self.worker_index}): "
             f"{values[copy, agent]}; legal: finite numbers."
         )
+
+    @override(EnvRunner)
+    def apply(self, func: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Calls a function with this runner, in its own process.
+
+        An error that ended `sample()` is raised for the caller to see, and the process stays. Of any other one RLlib
+        takes the process to be broken, and ends it.
+        """
+        try:
+            return func(self, *args, **kwargs)
+        except Exception as error:
+            ignored = self.config.ignore_env_runner_failures and not self.config.restart_failed_env_runners
+            if error is self.error and not ignored:
+                self.error = portable(error, f"env runner {self.worker_index}")
+                raise self.error from error.__cause__
+            raised = error
+
+        def again(_: Any) -> None:
+            raise raised
+
+        return super().apply(again)
 
     @override(EnvRunner)
     def get_metrics(self) -> Any:
@@ -312,6 +437,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                 "num_envs": self.num_envs,
                 "env": snapshot(self.env),
                 "acting": self.acting.get_state(),
+                "watched": None if self._watcher is None else self._watcher.get_state(),
                 **{name: getattr(self, name) for name in _SAMPLING_STATE},
             }
         return state
@@ -346,6 +472,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self.acting.set_state(sampling["acting"])
         for name in _SAMPLING_STATE:
             setattr(self, name, pickle.loads(pickle.dumps(sampling[name])))
+        if self._watcher is not None:
+            self._watcher.set_state(sampling.get("watched"))
 
     @override(Checkpointable)
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:

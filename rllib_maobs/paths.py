@@ -1,0 +1,44 @@
+"""Paths of checkpoints as people write them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path, PurePath
+from typing import Any, Self
+
+from ray.rllib.utils.annotations import override
+from ray.rllib.utils.checkpoints import Checkpointable
+
+
+def absolute(path: Any) -> Any:
+    """A path as RLlib takes it: absolute, without `~`; URIs ("s3://...") and Tune's checkpoints stay as they are."""
+    if not isinstance(path, str | PurePath) or "://" in os.fspath(path):
+        return path
+    return str(Path(path).expanduser().absolute())
+
+
+class AnyPath(Checkpointable):
+    """Lets a Checkpointable be saved to, and restored from, relative paths: RLlib takes those for URIs."""
+
+    @override(Checkpointable)
+    def save_to_path(self, path: Any = None, **kwargs: Any) -> str:
+        """RLlib's; returns the path."""
+        saved: str = super().save_to_path(_local(path, kwargs), **kwargs)
+        return saved
+
+    @override(Checkpointable)
+    def restore_from_path(self, path: Any, **kwargs: Any) -> None:
+        """RLlib's."""
+        super().restore_from_path(_local(path, kwargs), **kwargs)
+
+    @classmethod
+    @override(Checkpointable)
+    def from_checkpoint(cls, path: Any, filesystem: Any = None, **kwargs: Any) -> Self:
+        """RLlib's."""
+        made: Self = super().from_checkpoint(path if filesystem else absolute(path), filesystem=filesystem, **kwargs)
+        return made
+
+
+def _local(path: Any, given: dict[str, Any]) -> Any:
+    """With a filesystem a path is that filesystem's own."""
+    return path if given.get("filesystem") else absolute(path)
