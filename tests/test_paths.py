@@ -7,7 +7,7 @@ from ray.tune import Checkpoint
 
 import rllib_maobs as maobs
 from rllib_maobs.paths import absolute
-from rllib_maobs.play import make_policy
+from rllib_maobs.policies import make_policy
 from tests.conftest import small_config
 
 PATHS = ["relative", "./a b/", "ü [1] #x 100%", "~/home sweet", "br[0]*/deep/"]
@@ -28,7 +28,7 @@ def test_checkpoints_by_any_path(ray_session: None, tmp_path: Path, monkeypatch:
         assert not (tmp_path / "~").exists()
         for path in (PATHS[1], Checkpoint.from_directory(PATHS[1])):
             maobs.JointAlgorithm.from_checkpoint(path).stop()
-        make_policy(maobs.parallel_env("spread-3a"), PATHS[3])
+        make_policy(maobs.make_vec("spread-3a"), PATHS[3])
     finally:
         algo.stop()
 
