@@ -24,6 +24,7 @@ from rllib_maobs.algorithms import (
     register_algorithm,
 )
 from rllib_maobs.algorithms.registry import register_algorithms
+from rllib_maobs.checkpoints import load_networks
 from rllib_maobs.envs import (
     SCENARIOS,
     EpisodeMetricsCallback,
@@ -135,6 +136,7 @@ __all__ = [
     "VDNConfig",
     "VectorEnv",
     "layout_size",
+    "load_networks",
     "make_vec",
     "parallel_env",
     "register",

@@ -44,8 +44,8 @@ class Batch(NamedTuple):
         next: n steps later.
         actions: `(B, N, A)` in [-1, 1], or one-hot.
         rewards: Discounted, of the n steps, `(B, N)`.
-        discount: Of the value after them, `(B, 1)`: gamma^n, or 0.0 where the episode really ended; a time limit
-            bootstraps.
+        discount: Of each agent's value after them, `(B, N)`: gamma^n, or 0.0 for an agent that reached a terminal
+            state; one that a time limit stopped bootstraps, also where others terminated in the same step.
         noise: Random numbers of the losses `(B, N, A)`, which the learner adds: normal for smoothed target actions,
             uniform for discrete actors.
     """
@@ -56,6 +56,15 @@ class Batch(NamedTuple):
     rewards: Tensor
     discount: Tensor
     noise: Tensor | None = None
+
+    @property
+    def team_discount(self) -> Tensor:
+        """Of the team's one value, `(B, 1)`: 0.0 only where every agent terminated.
+
+        As long as one of them was merely stopped by a time limit, there would have been more of the team reward that
+        this value is the sum of.
+        """
+        return self.discount.amax(-1, keepdim=True)
 
     def unbind(self) -> list[Batch]:
         """The minibatches of a batch whose tensors have a further dimension in front."""
@@ -78,7 +87,7 @@ class JointReplayBuffer(Checkpointable):
     """Uniform replay of a fixed team's joint transitions.
 
     A row holds what belongs to one env step of one environment copy: observations `(N, O)`, actions `(N, A)`,
-    rewards `(N,)`, whether the episode terminated there and, if wanted, the state `(S,)`. The next
+    rewards `(N,)`, which agents terminated there `(N,)` and, if wanted, the state `(S,)`. The next
     observation is not stored a second time: each row links to its successor. An episode's true last
     observation gets a row of its own, without an action, so a truncated step bootstraps from what was really
     there and never from the observation after the reset. Rows of several environment copies lie mixed in
@@ -122,14 +131,19 @@ class JointReplayBuffer(Checkpointable):
             "obs": (num_agents, observation_size),
             "actions": (num_agents, action_size),
             "rewards": (num_agents,),
-            "terminated": (1,),
+            "terminated": (num_agents,),
         }
         if state_size:
             shapes["state"] = (state_size,)
         if recurrent_state is not None:
             shapes["recurrent_state"] = (num_agents, *recurrent_state)
         # Empty memory is not touched, so it costs nothing until rows are written to it.
-        self._columns = {name: torch.empty((capacity, *shape), device=device) for name, shape in shapes.items()}
+        self._columns = {
+            name: torch.empty(
+                (capacity, *shape), dtype=torch.bool if name == "terminated" else torch.float32, device=device
+            )
+            for name, shape in shapes.items()
+        }
         # Rows are numbered for ever; row i lies at i % capacity and is there while i >= head - capacity.
         self._head = 0
         self._next = np.full(capacity, _NONE, dtype=np.int64)
@@ -169,8 +183,9 @@ class JointReplayBuffer(Checkpointable):
             obs: Observations before each step, `(L, E, N, O)`.
             actions: Actions in [-1, 1], `(L, E, N, A)`.
             rewards: Rewards, `(L, E, N)`.
-            terminated: Whether the episode ended in a terminal state at this step, `(L, E)`.
-            truncated: Whether a time limit cut it at this step, `(L, E)`.
+            terminated: Whether each agent reached a terminal state at this step, `(L, E, N)`.
+            truncated: Whether a time limit ended the episode for the others at this step, `(L, E)`. It is over there,
+                and where all agents terminated.
             final_obs: The true last observations of the episodes that ended, in the order of their steps
                 (step first, then copy), `(D, N, O)`.
             state: States before each step, `(L, E, S)`, if states are stored.
@@ -181,8 +196,8 @@ class JointReplayBuffer(Checkpointable):
             start: Number of the first step among the source's. A gap to what was added before (a lost or
                 restarted runner) breaks the link instead of joining two episodes.
         """
-        length, copies = terminated.shape
-        done = terminated | truncated
+        length, copies = truncated.shape
+        done = terminated.all(-1) | truncated
         steps = length * copies
         row = self._head + np.arange(steps).reshape(length, copies)
         last = self._head + steps + np.arange(int(done.sum()))  # the rows of the final observations
@@ -210,7 +225,7 @@ class JointReplayBuffer(Checkpointable):
         self._previous[row % self.capacity] = previous
         self._previous[last % self.capacity] = row[done]
 
-        self._write(row.reshape(-1), obs=obs, actions=actions, rewards=rewards, terminated=terminated[..., None])
+        self._write(row.reshape(-1), obs=obs, actions=actions, rewards=rewards, terminated=terminated)
         self._write(last, obs=final_obs)
         if "state" in self._columns:
             self._write(row.reshape(-1), state=state)
@@ -231,7 +246,8 @@ class JointReplayBuffer(Checkpointable):
             if values is None:
                 raise ValueError(f"The replay buffer stores {name!r}, but none was given.")
             # np.require: arrays from a remote runner are read-only, which torch warns of.
-            flat = torch.from_numpy(np.require(values, np.float32, "W")).reshape(rows.size, *column.shape[1:])
+            dtype = np.bool_ if column.dtype == torch.bool else np.float32
+            flat = torch.from_numpy(np.require(values, dtype, "W")).reshape(rows.size, *column.shape[1:])
             column[first : first + split] = flat[:split]
             column[: rows.size - split] = flat[split:]
 
@@ -266,13 +282,13 @@ class JointReplayBuffer(Checkpointable):
             last, steps = np.where(more, ahead, last), steps + more
         following = self._next[last] % self.capacity
         ended = self._columns["terminated"].index_select(0, self._places(last))
-        discount = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None] * (1.0 - ended)
+        discount = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None] * ~ended
         return Batch(
             now=self._moment("now", rows, shape, seq_length),
             next=self._moment("next", following, shape, seq_length),
             actions=self._take("actions", rows, shape),
             rewards=total.view(*shape, -1),
-            discount=discount.view(*shape, 1),
+            discount=discount.view(*shape, -1),
         )
 
     def _moment(self, name: str, rows: NDArray[np.int64], shape: Sequence[int], seq_length: int) -> Moment:

@@ -34,7 +34,9 @@ def small_config(algorithm: str, **options: Any) -> maobs.JointConfig:
         options = {"action_mode": "discrete", **options}
     config.environment("maobs/spread-3a", env_config=options)
     config.env_runners(num_envs_per_env_runner=2)
-    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000, seq_length=3)
+    config.training(train_batch_size_per_learner=16, replay_buffer_capacity=5_000)
+    if config.recurrent:
+        config.training(seq_length=3)
     config.reporting(min_sample_timesteps_per_iteration=40)
     return config.debugging(seed=0)
 
@@ -57,7 +59,8 @@ def random_batch(config: maobs.JointConfig, size: int = 32, seed: int = 0) -> Ba
     else:
         actions, noise = torch.tanh(normal(size, n, a)) * legal, normal(size, n, a)
     rewards = normal(size, 1).expand(-1, n).clone() if config.supports.team_reward else normal(size, n)
-    discount = config.gamma**config.n_step * (normal(size, 1) < 0.5).to(torch.get_default_dtype())
+    goes_on = (normal(size, 1) < 0.5) & (normal(size, n) < 0.8)  # nobody, all, or some
+    discount = config.gamma**config.n_step * goes_on.to(torch.get_default_dtype())
 
     def moment(name: str) -> Moment:
         obs = normal(size, n, o) * present

@@ -201,7 +201,7 @@ class Equations:
         critic: dict[int, list[Tensor]] = {}
         actor: dict[int, list[Tensor]] = {}
         for row in rows:
-            r, discount = rewards[row], sample.discount[row, 0]
+            r, discount = rewards[row], sample.discount[row]  # (N,) each
             if self.name in ("iql", "vdn", "qmix"):
                 self.q_learning(sample, row, r, discount, critic)
                 continue
@@ -215,7 +215,7 @@ class Equations:
                 self.facmac(sample, row, r, discount, taken, nexts, now, stage, critic, actor)
                 continue
             for a in self.agents:
-                y = r[a] + discount * self.q("target_critic", sample.next, row, a, nexts).min().detach()
+                y = r[a] + discount[a] * self.q("target_critic", sample.next, row, a, nexts).min().detach()
                 q = self.q("critic", sample.now, row, a, taken)
                 critic.setdefault(a, []).append((y - q).square().sum())
                 others = getattr(self.config, "other_agents_actions", "replay")
@@ -252,13 +252,13 @@ class Equations:
 
         if stage == "local":
             for a in self.agents:
-                y = r[a] + discount * local("target_critic", a, a, nexts[a], sample.next).detach()
+                y = r[a] + discount[a] * local("target_critic", a, a, nexts[a], sample.next).detach()
                 critic.setdefault(a, []).append((y - local("critic", a, a, taken[a], sample.now)).square())
                 actor.setdefault(a, []).append(-local("critic", a, a, now[a], sample.now))
             return
         for m, (mixer, target_mixer) in enumerate(zip(self.mixers, self.target_mixers, strict=True)):
             values = [local("target_critic", m if own else j, j, nexts[j], sample.next) for j in self.agents]
-            y = r[0] + discount * self.mixed(target_mixer, values, self.state(sample.next, row)).detach()
+            y = r[0] + max(discount) * self.mixed(target_mixer, values, self.state(sample.next, row)).detach()
             values = [local("critic", m if own else j, j, taken[j], sample.now) for j in self.agents]
             critic.setdefault(m, []).append((y - self.mixed(mixer, values, self.state(sample.now, row))).square())
             current = [now[j].detach() if own and j != m else now[j] for j in self.agents]
@@ -274,14 +274,14 @@ class Equations:
             nexts.append(after[judge.argmax()])
         if self.name == "iql":
             for a in self.agents:
-                critic.setdefault(a, []).append((r[a] + discount * nexts[a] - values[a]).square())
+                critic.setdefault(a, []).append((r[a] + discount[a] * nexts[a] - values[a]).square())
             return
         if self.name == "vdn":
             q, next_q = sum(values), sum(nexts)
         else:
             q = self.mixed(self.mixers[0], values, self.state(sample.now, row))
             next_q = self.mixed(self.target_mixers[0], nexts, self.state(sample.next, row)).detach()
-        critic.setdefault(0, []).append((r[0] + discount * next_q - q).square())
+        critic.setdefault(0, []).append((r[0] + max(discount) * next_q - q).square())
 
     def gradients(self, sample: Batch, stage: str = "") -> dict[str, Any]:
         """Losses by role, and gradients: of every distinct network a list, in the order of its parameters."""

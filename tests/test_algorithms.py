@@ -245,7 +245,10 @@ class PictureAgents(TwoAgents):
         (lambda c: c.rl_module(model_config={"activation": "step"}), r"activation'\] must be one of 'relu', 'tanh'"),
         (lambda c: c.rl_module(model_config={"hidden_sizes": ()}), r"hidden_sizes'\] must be positive integers"),
         (lambda c: c.rl_module(model_config={"lstm_cell_size": 0}), r"lstm_cell_size'\] must be a positive integer"),
-        (lambda c: c.rl_module(model_config={"hiden": (8,)}), r"Unknown model_config setting 'hiden'; legal are"),
+        (
+            lambda c: c.rl_module(model_config={"hiden": (8,)}),
+            r"model_config sets 'hiden' \(did you mean 'hidden_sizes'\?\); legal are",
+        ),
         (lambda c: c.learners(num_learners=1), r"num_learners must be 0, not 1"),
         (
             lambda c: c.multi_agent(policies={"all", "none"}, policy_mapping_fn=lambda a, e, **k: "all"),
@@ -280,7 +283,7 @@ def test_wrong_settings_are_refused_before_anything_starts(ray_session: None, ch
 def test_the_state_is_what_the_critic_is_fed(ray_session: None, algorithm: str) -> None:
     """The critic's input widths, for both kinds of state, are those of the family table."""
     widths = {
-        "iddpg": {"observations": (18, 5), "world": (18, 5)},
+        "iddpg": {"observations": (18, 5)},
         "maddpg": {"observations": (54, 15), "world": (22, 15)},
         "maddpg-l": {"observations": (54, 5), "world": (22, 5)},
     }[algorithm]

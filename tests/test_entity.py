@@ -134,7 +134,9 @@ def test_it_works_in_rllibs_own_runner(ray_session: None, actor: str) -> None:
 )
 @pytest.mark.parametrize("algorithm", ["maddpg", "iddpg"])
 def test_every_task_takes_them(ray_session: None, scenario: str, algorithm: str) -> None:
-    config = small_config(algorithm).training(**ENTITY)
+    config = small_config(algorithm).training(actor="entity", critic="entity")
+    if config.uses_state:
+        config.training(critic_state="world")
     env_config = {"prey": "learned"} if "prey" in scenario else {}
     algo = config.environment(f"maobs/{scenario}", env_config=env_config).build_algo()
     assert algo.train()["learners"]["__all_modules__"]["num_updates_lifetime"] == 24

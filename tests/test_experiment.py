@@ -27,7 +27,7 @@ from ray.rllib.algorithms import Algorithm
 
 import rllib_maobs as maobs
 from rllib_maobs.envs import make_vec
-from rllib_maobs.experiment import Experiment, decayed, load_curves, plot_curves, summarise
+from rllib_maobs.experiment import Experiment, decayed, fading, load_curves, plot_curves, summarise
 from rllib_maobs.experiment import claim as claim_module
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
@@ -539,7 +539,7 @@ def test_the_plan_of_a_quick_run_measures_nothing(capsys: pytest.CaptureFixture[
         ({}, "Row 'a': unknown algorithm ''; legal are iddpg"),
         (
             {"algorithm": "maddpg", "actr_lr": 1.0},
-            r"Row 'a' has no setting 'actr_lr' \(did you mean 'actor_lr'\?\); legal are env_config, train_horizon, "
+            r"Row 'a' has no setting 'actr_lr' \(did you mean 'actor_lr'\?\); legal are env_config, train_env_config, "
             r".*, quick, and arguments of training\(\): other_agents_actions, actor_lr, .*gamma",
         ),
         ({"algorithm": "iddpg", "other_agents_actions": "joint"}, "has no setting 'other_agents_actions'"),
@@ -551,6 +551,10 @@ def test_the_plan_of_a_quick_run_measures_nothing(capsys: pytest.CaptureFixture[
         ({"algorithm": "maddpg", "lr": 1e-3}, "Row 'a' has no setting 'lr'"),
         ({"algorithm": "maddpg", "quick": {"quick": {}}}, "Row 'a', quick has no setting 'quick'"),
         ({"algorithm": "maddpg", "quick": True}, "quick=True is illegal; legal: a mapping of settings"),
+        (
+            {"algorithm": "maddpg", "train_env_config": 3},
+            "Row 'a': train_env_config=3 is illegal; legal: a mapping of the environment's options",
+        ),
     ],
 )
 def test_rows_with_unknown_settings_are_refused(row: dict[str, Any], message: str) -> None:
@@ -612,8 +616,10 @@ def test_scripts_have_the_settings_of_the_paper(
         assert config.name == (spec.algorithm if spec.algorithm in maobs.ALGORITHMS else "facmac")
         assert len(config.team.agents) == agents
         assert (config.actor_lr, config.critic_lr, config.gamma) == (0.001, critic_lr, 0.95)
-        assert (config.train_batch_size_per_learner, config.seq_length) == (batch, seq_length)
-        assert (config.seed, config.critic_state, config.torch_compile_learner) == (5, "world", True)
+        assert config.train_batch_size_per_learner == batch
+        assert config.window_length == (seq_length if config.recurrent else 0)
+        assert config.critic_state == ("world" if config.uses_state else "observations")
+        assert (config.seed, config.torch_compile_learner) == (5, True)
         assert (spec.stop_timesteps, spec.num_envs_per_env_runner, spec.one_policy) == (2_000_000, 8, False)
         # Training episodes are short, evaluation is the paper's: 10 noise-free episodes of 100 steps.
         evaluation = config.get_evaluation_config_object()
@@ -645,13 +651,48 @@ def test_scripts_have_a_row_that_learns_in_minutes(script: str, agents: int) -> 
     assert (config.name, config.actor, config.critic, config.critic_state) == ("maddpg", "entity", "entity", "world")
     assert config.module_ids == ("all",) * agents
     assert config.critic_lr == [[0, 1e-3], [steps // 2, 1e-3], [steps, 5e-5]]
-    assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"]}
-    assert tuned.evaluation_options == {"action_mode": "force", "horizon": 100}
+    stricter = row.get("train_env_config", {})
+    assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"], **stricter}
+    scenario = maobs.make_vec(tuned.env.removeprefix("maobs/")).scenario
+    usual = {name: getattr(scenario.options, name) for name in stricter}
+    assert tuned.evaluation_options == {"action_mode": "force", "horizon": 100, **usual}
     quick = experiment.specs(parsed(experiment, "--quick"))
     assert [spec.name for spec in quick] == ["maddpg-entity-seed0", "maddpg-seed0"]
     small = row["quick"]["stop_timesteps"]
     assert small < steps / 3
     assert [trial_settings(spec) for spec in quick] == [(small, 4000, 20, True), (4000, 400, 5, False)]
+
+
+def test_settings_of_the_experiment_may_depend_on_the_env_steps_and_be_classes() -> None:
+    training = {"actor_lr": decayed(1e-3), "exploration": fading(epsilon=0.1, noise=0.2, final=0.02)}
+    experiment = replace(EXPERIMENT, training={**training, "actor": maobs.MLPActor})
+    spec = experiment.specs(parsed(experiment, "--stop-timesteps", "1000"))[0]
+    assert spec.training["actor_lr"] == [[0, 1e-3], [500, 1e-3], [1000, 5e-5]]
+    assert spec.training["exploration"] == {"epsilon": 0.1, "noise": 0.2, "decay": pytest.approx(3e-4), "final": 0.02}
+    assert spec.training["actor"] is maobs.MLPActor
+
+
+def test_what_training_changes_of_the_environment_evaluation_does_not_see(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    row: dict[str, Any] = {"algorithm": "maddpg", "env_config": {"agent_collision_penalty": 2.0}}
+    row["train_env_config"] = {"agent_collision_penalty": 5.0, "obstacle_collision_penalty": 4.0}
+    experiment = replace(EXPERIMENT, algorithms=("a",), variants={"a": row})
+    (spec,) = experiment.specs(parsed(experiment, "--seeds", "0"))
+    prices = ["agent_collision_penalty", "obstacle_collision_penalty"]
+    assert [spec.env_config[price] for price in prices] == [5.0, 4.0]
+    evaluation = spec.build_config().get_evaluation_config_object()
+    assert [evaluation.env_config[price] for price in prices] == [2.0, 1.0]  # the row's, and the scenario's default
+
+    def refused(experiment: Experiment) -> str:
+        with pytest.raises(SystemExit):
+            experiment.main(["--results-dir", str(tmp_path / "a")])
+        return capsys.readouterr().err
+
+    foreign = replace(experiment, env="theirs")
+    assert "train_env_config changes obstacle_collision_penalty of theirs: give what evaluation" in refused(foreign)
+    wrong = {**row, "train_env_config": {"agent_colision_penalty": 5.0}}
+    assert "did you mean 'agent_collision_penalty'" in refused(replace(experiment, variants={"a": wrong}))
 
 
 def test_variants_have_settings_that_depend_on_the_env_steps() -> None:

@@ -80,7 +80,8 @@ OTHERS = ("replay", "current", "joint")
 CARRIED = "h and c stored"
 # Algorithm, settings, further changes; the name of the case.
 CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
-    **{f"{a}, {s}": (a, {"critic_state": s}, []) for a in FAMILY for s in ("observations", "world")},
+    **{f"{a}, observations": (a, {}, []) for a in FAMILY},
+    **{f"{a}, world": (a, {"critic_state": "world"}, []) for a in FAMILY if a != "iddpg"},
     **{f"maddpg, others' actions {o}": ("maddpg", {"other_agents_actions": o}, []) for o in ("current", "joint")},
     "maddpg-lstm": ("maddpg-lstm", {}, []),
     **{f"{a} with LSTM": (a, {"actor": "lstm"}, []) for a in ("iddpg", "maddpg-l", "facmac", "iql", "vdn", "qmix")},
@@ -120,7 +121,10 @@ CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
 
 def configured(case: str) -> maobs.JointConfig:
     algorithm, settings, changes = CASES[case]
-    config = small_config(algorithm).training(**settings)
+    config = small_config(algorithm)
+    if not config.uses_state:
+        settings = {name: value for name, value in settings.items() if name != "critic_state"}
+    config.training(**settings)
     for change in changes:
         change(config)
     return config

@@ -83,6 +83,8 @@ class Case(NamedTuple):
             refusals.append(f"{self.algorithm} is not defined with recurrent actors")
         if not can.parameter_sharing and self.policies == "shared":
             refusals.append(f"{self.algorithm} is not defined with shared policies")
+        if self.critic_state == "world" and not maobs.ALGORITHMS[self.algorithm]().uses_state:
+            refusals.append(f"critic_state must be 'observations', .*: neither critics nor a mixer of {self.algorithm}")
         if self.policies == "shared" and "different_agents" in traits:
             refusals.append("Agents that share policy 'all' must have spaces of equal size")
         return refusals
@@ -94,7 +96,9 @@ class Case(NamedTuple):
         config = maobs.ALGORITHMS[self.algorithm]()
         config.environment(f"maobs/{env}", env_config={**options, "action_mode": mode})
         config.training(train_batch_size_per_learner=16, updates_per_env_step=0.02, replay_buffer_capacity=3_000)
-        config.training(actor=self.actor, seq_length=2, critic_state=self.critic_state)
+        config.training(actor=self.actor, critic_state=self.critic_state)
+        if self.actor == "lstm":
+            config.training(seq_length=2)
         if self.policies == "shared":
             config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *args, **kwargs: "all")
         config.env_runners(num_envs_per_env_runner=20)
@@ -213,6 +217,6 @@ def test_wrong_settings_of_facmac_are_refused(ray_session: None, settings: dict[
         config.build_algo()
 
 
-def test_the_readme_shows_what_the_algorithms_declare() -> None:
-    readme = (Path(__file__).parent.parent / "README.md").read_text()
-    assert support_table() in readme
+def test_the_docs_show_what_the_algorithms_declare() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "algorithms.md").read_text()
+    assert support_table() in page

@@ -179,7 +179,9 @@ def config_of(plug: str, *, compiled: bool = False, shared: bool = False) -> mao
     config.environment(maobs.MAObsEnv, env_config={"scenario": scenario, "horizon": 25})
     config.training(**PLUGS[plug], train_batch_size_per_learner=16, updates_per_env_step=0.05, critic_lr=1e-3)
     config.env_runners(num_envs_per_env_runner=4).reporting(min_sample_timesteps_per_iteration=1000)
-    config.rl_module(model_config={"hidden_sizes": (16, 16)}).debugging(seed=0)
+    config.debugging(seed=0)
+    if plug != "everything":  # whose networks have no such sizes
+        config.rl_module(model_config={"hidden_sizes": (16, 16)})
     if shared:
         config.multi_agent(policies={"all"}, policy_mapping_fn=all_one)
     # Traced alike by another backend, without half a minute of C++ for each.

@@ -1,5 +1,7 @@
 """The command that shows and films episodes, with every kind of policy."""
 
+import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -11,9 +13,10 @@ from PIL import Image
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from rllib_maobs.envs import MAObsEnv, make_vec, parallel_env
-from rllib_maobs.play import CheckpointPolicy, main, make_policy, parse_options, play
-from tests.conftest import small_config
+from rllib_maobs.envs import MAObsEnv, Spread, make_vec, parallel_env
+from rllib_maobs.play import main, parse_options, play
+from rllib_maobs.policies import CheckpointPolicy, make_policy, saved_options
+from tests.conftest import build_learner, small_config
 
 
 def test_command_line_films(tmp_path):
@@ -46,21 +49,21 @@ def test_mean_return_is_that_of_all_agents():
     vec.reset(seed=0)
     for _ in range(10):
         total += vec.step(vec.heuristic())[1].mean()
-    metrics = play(env, make_policy(env, "heuristic"))
+    metrics = play(env, make_policy(env.vector, "heuristic"))
     assert metrics["return_mean"] == pytest.approx(total) != pytest.approx(metrics["return_agent_0"])
 
 
 def test_random_policy_moves_every_agent_by_itself():
     env = parallel_env("simple-tunnel")
-    actions = make_policy(env, "random")(env.reset(seed=0)[0])
-    assert len({tuple(action) for action in actions.values()}) == 3
+    (actions,) = make_policy(env.vector, "random")(env.vector.observe())
+    assert len({tuple(action) for action in actions}) == 3
 
 
 def test_random_policy_follows_the_seed():
     results = []
     for seed in (0, 0, 1):
         env = parallel_env("simple-tunnel", horizon=10)
-        results.append(play(env, make_policy(env, "random", seed), episodes=2))
+        results.append(play(env, make_policy(env.vector, "random", seed), episodes=2))
     assert results[0] == results[1] != results[2]
 
 
@@ -89,7 +92,7 @@ def test_options_are_literals_or_words():
         (["tunnel", "--record", "film.avi"], "cannot record to 'film.avi'"),
         (
             ["tunnel", "--policy", "hueristic", "--no-window"],
-            "--policy 'hueristic' is illegal; legal: random, heuristic",
+            "'hueristic' is no checkpoint; legal: the folder of an RLlib algorithm checkpoint",
         ),
     ],
 )
@@ -98,6 +101,13 @@ def test_mistakes_end_in_a_sentence(arguments, message, capsys):
         main(arguments)
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def acts(policy, observations):
+    """Actions by agent, as a policy chooses them for one copy."""
+    size = max(map(len, observations.values()))
+    joint = np.stack([np.pad(observation, (0, size - len(observation))) for observation in observations.values()])
+    return dict(zip(observations, policy(joint[None])[0], strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +122,9 @@ def maddpg_checkpoint(ray_session, tmp_path_factory):
 def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
     path, modules = maddpg_checkpoint
     env = parallel_env("spread-3a")
-    policy = make_policy(env, path)
+    policy = make_policy(env.vector, path)
     observations, _ = env.reset(seed=0)
-    actions = policy(observations)
+    actions = acts(policy, observations)
     for agent, module in modules.items():
         with torch.no_grad():
             expected = module.forward_inference({"obs": torch.from_numpy(observations[agent])[None]})["actions"][0]
@@ -122,9 +132,9 @@ def test_checkpoint_of_this_package_acts_as_trained(maddpg_checkpoint):
         assert env.action_space(agent).contains(actions[agent])
     assert not np.allclose(actions["agent_0"], actions["agent_1"])
     with pytest.raises(ValueError, match=r"agent_0 observes \(34,\) in Spread\(.*but was trained on \(18,\)"):
-        make_policy(parallel_env("spread-3a", num_agents=3, num_obstacles=10), path)
+        make_policy(make_vec("spread-3a", num_agents=3, num_obstacles=10), path)
     with pytest.raises(ValueError, match="has no module for agent_3; it has agent_0, agent_1, agent_2"):
-        make_policy(parallel_env("spread-3a", num_agents=4), path)
+        make_policy(make_vec("spread-3a", num_agents=4), path)
 
 
 def test_checkpoint_of_agents_that_share_parameters_and_know_their_numbers(ray_session, tmp_path):
@@ -133,10 +143,10 @@ def test_checkpoint_of_agents_that_share_parameters_and_know_their_numbers(ray_s
     algo = config.build_algo()
     path, module = algo.save_to_path(str(tmp_path)), algo.get_module("all")
     env = parallel_env("spread-3a")
-    policy = make_policy(env, path)
+    policy = make_policy(env.vector, path)
     observations, _ = env.reset(seed=0)
     alike = {agent: observations["agent_0"] for agent in observations}
-    actions = policy(alike)
+    actions = acts(policy, alike)
     for index, agent in enumerate(alike):
         seen = np.append(np.eye(3, dtype=np.float32)[index], alike[agent])
         expected = module.forward_inference({"obs": torch.from_numpy(seen)[None]})["actions"][0]
@@ -144,7 +154,7 @@ def test_checkpoint_of_agents_that_share_parameters_and_know_their_numbers(ray_s
     assert not np.allclose(actions["agent_0"], actions["agent_1"])
     algo.stop()
     with pytest.raises(ValueError, match=r"agent_0 observes \(34,\) in Spread\(.*but was trained on \(18,\)"):
-        make_policy(parallel_env("spread-3a", num_agents=3, num_obstacles=10), path)
+        make_policy(make_vec("spread-3a", num_agents=3, num_obstacles=10), path)
 
 
 def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
@@ -164,9 +174,9 @@ def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
     modules = {name: algo.get_module(name) for name in ("hunters", "hunted")}
     algo.stop()
     env = parallel_env("obstacle-predator-prey", **options)
-    policy = make_policy(env, path)
+    policy = make_policy(env.vector, path)
     observations, _ = env.reset(seed=0)
-    actions = policy(observations)
+    actions = acts(policy, observations)
     for agent, name in (("predator_0", "hunters"), ("predator_2", "hunters"), ("prey_0", "hunted")):
         logits = modules[name].forward_inference({"obs": torch.from_numpy(observations[agent])[None]})
         mean = logits["action_dist_inputs"][0, :5].detach().numpy()
@@ -174,7 +184,7 @@ def test_checkpoint_with_a_policy_mapping_of_its_own(ray_session, tmp_path):
     play(env, policy)
     shutil.rmtree(tmp_path / "learner_group" / "learner" / "rl_module" / "hunters")
     with pytest.raises(ValueError, match="has no module for predator_0; it has hunted"):
-        make_policy(env, path)
+        make_policy(env.vector, path)
 
 
 @pytest.fixture(scope="module")
@@ -190,6 +200,69 @@ def entity_checkpoint(ray_session, tmp_path_factory):
     algo.stop()
 
 
+def test_a_checkpoint_plays_what_it_was_evaluated_on(ray_session, tmp_path, capsys):
+    config = small_config("iddpg", horizon=7, num_agents=2, action_mode="force", num_obstacles=1)
+    config.evaluation(evaluation_config={"env_config": {"horizon": 9}})
+    algo = config.build_algo()
+    path = algo.save_to_path(str(tmp_path))
+    algo.stop()
+    options = {"horizon": 9, "num_agents": 2, "action_mode": "force", "num_obstacles": 1}
+    assert saved_options(path, "spread-3a") == options
+    # Another task keeps what its own name says.
+    assert saved_options(path, "spread-9a") == {"horizon": 9, "action_mode": "force"}
+    assert saved_options(path, "simple-tunnel") == {"horizon": 9, "num_agents": 2, "action_mode": "force"}
+    for nothing in ("random", "heuristic", str(tmp_path / "none")):
+        assert saved_options(nothing, "spread-3a") == {}
+    main(["spread-3a", "--policy", path, "--no-window"])
+    printed = capsys.readouterr().out
+    assert "options of the checkpoint: horizon=9 num_agents=2 action_mode=force num_obstacles=1" in printed
+    assert re.search(r"episode_length +9.000", printed)
+    main(["spread-3a", "--policy", path, "--no-window", "horizon=4"])
+    assert re.search(r"episode_length +4.000", capsys.readouterr().out)
+
+
+def test_options_of_stock_ppo_and_of_foreign_environments(tmp_path):
+    def checkpoint(name, **config):
+        (tmp_path / name / "learner_group" / "learner" / "rl_module").mkdir(parents=True)
+        arguments = {"ctor_args_and_kwargs": (({"evaluation_config": None, **config},), {})}
+        (tmp_path / name / "class_and_ctor_args.pkl").write_bytes(pickle.dumps(arguments))
+        return str(tmp_path / name)
+
+    ours = checkpoint("ours", env=MAObsEnv, env_config={"scenario": "tunnel", "gap": 0.3, "render_mode": "human"})
+    assert saved_options(ours, "tunnel") == {"gap": 0.3}
+    assert saved_options(checkpoint("class", env="x", env_config={"scenario": Spread, "horizon": 5}), "spread-3a")
+    assert saved_options(checkpoint("foreign", env="mine", env_config={"horizon": 5}), "tunnel") == {}
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "iql"])
+def test_a_normalised_agent_takes_its_normaliser_along(ray_session, tmp_path, algorithm):
+    """In an algorithm's checkpoint, as its module, and as a network without RLlib."""
+    algo = small_config(algorithm).training(normalize_observations=True).build_algo()
+    algo.train()
+    path, module = algo.save_to_path(str(tmp_path / "checkpoint")), algo.get_module("agent_1")
+    algo.stop()
+    obs = 3.0 + torch.randn(5, 18, generator=torch.Generator().manual_seed(0))
+    want = module.forward_inference({"obs": obs})["actions"]
+    plain = module.acting(obs)
+    assert not torch.allclose(want.float(), plain.argmax(-1).float() if algorithm == "iql" else torch.tanh(plain))
+    network = module.exportable()
+    torch.testing.assert_close(network(obs), want)
+    torch.jit.trace(network, obs).save(tmp_path / "agent.pt")
+    torch.testing.assert_close(torch.jit.load(tmp_path / "agent.pt")(obs), want)
+    env = parallel_env("spread-3a", **saved_options(path, "spread-3a"))
+    observations, _ = env.reset(seed=0)
+    seen = torch.from_numpy(observations["agent_1"])[None]
+    (action,) = module.forward_inference({"obs": seen})["actions"].detach().numpy()
+    acted = acts(make_policy(env.vector, path), observations)["agent_1"]
+    np.testing.assert_allclose(acted, action, rtol=1e-5, atol=1e-6)
+
+
+def test_a_recurrent_agent_is_no_plain_network(ray_session):
+    learner = build_learner(small_config("maddpg-lstm"))
+    with pytest.raises(ValueError, match="its actions depend on a window of observations"):
+        learner.module["agent_0"].exportable()
+
+
 @pytest.mark.parametrize(
     ("scenario", "options"),
     [
@@ -203,15 +276,15 @@ def entity_checkpoint(ray_session, tmp_path_factory):
 def test_entity_networks_play_in_teams_of_another_size(entity_checkpoint, scenario, options):
     path, module = entity_checkpoint
     env = parallel_env(scenario, action_mode="force", horizon=4, **options)
-    policy = make_policy(env, path)
+    policy = make_policy(env.vector, path)
     observations, _ = env.reset(seed=0)
-    actions = policy(observations)
+    actions = acts(policy, observations)
     for agent, observation in observations.items():
         here = module.for_layout(env.observation_layouts[agent])
         with torch.no_grad():
             expected = here.forward_inference({"obs": torch.from_numpy(observation)[None]})["actions"][0]
         np.testing.assert_allclose(actions[agent], expected.numpy(), rtol=1e-5, atol=1e-6)
-    assert len({id(acting) for acting in policy._acting.values()}) == 1
+    assert len(policy._groups) == 1
     assert set(play(env, policy)) > {"return_mean", "coverage"}
 
 
@@ -220,7 +293,7 @@ def test_networks_of_one_size_say_so(entity_checkpoint, maddpg_checkpoint):
     with pytest.raises(
         ValueError, match=r"was trained on \(18,\)\. Networks that act in teams of any size are those of tr"
     ):
-        make_policy(parallel_env("spread-3a", num_obstacles=10), path)
+        make_policy(make_vec("spread-3a", num_obstacles=10), path)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +310,7 @@ def test_networks_of_one_size_say_so(entity_checkpoint, maddpg_checkpoint):
 def test_other_actions_than_in_training_are_named(entity_checkpoint, mode, message):
     path, _ = entity_checkpoint
     with pytest.raises(ValueError, match=message):
-        make_policy(parallel_env("spread-9a", action_mode=mode), path)
+        make_policy(make_vec("spread-9a", action_mode=mode), path)
 
 
 @pytest.mark.parametrize("use_lstm", [False, True])
@@ -256,15 +329,15 @@ def test_checkpoint_of_stock_ppo_with_one_policy_for_all(ray_session, tmp_path, 
     path = algo.save_to_path(str(tmp_path))
     algo.stop()
     env = parallel_env("tunnel", action_mode=mode, horizon=5)
-    policy = make_policy(env, path)
+    policy = make_policy(env.vector, path)
     assert isinstance(policy, CheckpointPolicy)
     observations, _ = env.reset(seed=0)
-    actions = policy(observations)
+    actions = acts(policy, observations)
     assert all(env.action_space(agent).contains(action) for agent, action in actions.items())
     # Without exploration, and with memory forgotten between episodes, all episodes from one seed are alike.
     assert play(env, policy, seed=4) == play(env, policy, seed=4)
     if use_lstm:
         policy.reset()
-        first, second = policy._act("agent_0", observations["agent_0"]), policy._act("agent_0", observations["agent_0"])
+        first, second = (acts(policy, observations)["agent_0"] for _ in range(2))
         if mode == "mpe":
             assert not np.array_equal(first, second)

@@ -24,6 +24,12 @@ def drawn(buffer: JointReplayBuffer, shape: tuple[int, ...], **how: Any) -> dict
     return columns
 
 
+def terminates(episode: Any) -> Any:
+    """Which agents do at the end of an episode: all, none, or in every third one some; the others are truncated."""
+    kind, own = episode[..., None] % 3, np.arange(N) == episode[..., None] // 3 % N
+    return (kind == 0) | ((kind == 2) & own)
+
+
 class Simulator:
     """E copies whose every number tells copy, episode, step and agent; episodes of copy e last 3 + e steps."""
 
@@ -54,9 +60,8 @@ class Simulator:
             rows["rewards"].append(-obs[:, :, 0])
             self.t += 1
             over = self.t == self.length + np.arange(self.copies)
-            # Even episodes end by termination, odd ones by the time limit.
-            rows["terminated"].append(over & (self.episode % 2 == 0))
-            rows["truncated"].append(over & (self.episode % 2 == 1))
+            rows["terminated"].append(over[:, None] & terminates(self.episode))
+            rows["truncated"].append(over & (self.episode % 3 != 0))
             finals.append(self.obs()[over])
             final_states.append(np.repeat(self.obs()[over][:, 0, :1], S, axis=1))
             final_hiddens.append(self.hidden()[over])
@@ -83,7 +88,8 @@ def check(batch: dict[str, torch.Tensor], copies: int, length: int = 3) -> None:
     torch.testing.assert_close(batch["actions"], batch["obs"][:, :, :1] + torch.arange(A) / 100)
     torch.testing.assert_close(batch["rewards"], -batch["obs"][:, :, 0])
     over = t + 1 == length + copy
-    assert torch.equal(batch["discount"][:, 0], G * (~(over & (episode % 2 == 0))).float())
+    ended = over[:, None] & torch.from_numpy(terminates(episode.numpy()))
+    assert torch.equal(batch["discount"], G * (~ended).float())
     assert copy.max() < copies
 
 
@@ -229,8 +235,8 @@ def test_returns_of_n_steps_end_with_the_episode(fragment: int) -> None:
     own = batch["window"][:, -1, :, 0]
     want = sum(-(own + k) * (G**k * (k < steps))[:, None] for k in range(3))
     torch.testing.assert_close(batch["rewards"], want, rtol=1e-5, atol=1e-2)
-    over = (steps == left) & (episode % 2 == 0)
-    torch.testing.assert_close(batch["discount"][:, 0], torch.where(over, 0.0, G ** steps.float()))
+    over = (steps == left)[:, None] & torch.from_numpy(terminates(episode.numpy()))
+    torch.testing.assert_close(batch["discount"], torch.where(over, 0.0, (G ** steps.float())[:, None]))
     torch.testing.assert_close(batch["next_state"][:, 0], batch["next_window"][:, -1, 0, 0])
 
 
@@ -299,3 +305,17 @@ def test_too_small_a_buffer_says_so() -> None:
 def test_half_a_million_joint_steps_of_nine_agents_fit() -> None:
     assert JointReplayBuffer(500_000, 9, 50, 5).nbytes <= 1.3e9
     assert JointReplayBuffer(500_000, 9, 50, 5, 66).nbytes <= 1.3e9
+
+
+def test_the_teams_value_goes_on_until_all_agents_terminate() -> None:
+    buffer = JointReplayBuffer(1000, N, O, A, seed=0)
+    buffer.add(**Simulator(1).fragment(60))
+    batch = buffer.sample((500,), gamma=G)
+    ended = (batch.discount == 0.0).sum(1)
+    assert set(ended.tolist()) == {0, 1, N}
+    assert torch.equal(batch.team_discount, torch.where(ended == N, 0.0, G)[:, None])
+
+
+def test_who_terminated_takes_a_byte_for_each_agent() -> None:
+    buffer = JointReplayBuffer(500, N, O, A)
+    assert buffer._columns["terminated"].nbytes == 500 * N

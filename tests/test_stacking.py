@@ -206,7 +206,9 @@ def test_what_would_be_silently_wrong_is_refused(ray_session: None, change: dict
 
 def test_policies_differ_in_their_networks_alone(ray_session: None) -> None:
     config = small_config("maddpg-lstm").rl_module(rl_module_spec=specs(agent_1={"seq_length": 2}))
-    with pytest.raises(ValueError, match="RLModuleSpec of policy 'agent_1' sets 'seq_length'; policies may differ in"):
+    with pytest.raises(
+        ValueError, match="RLModuleSpec of policy 'agent_1' sets 'seq_length'; legal are hidden_sizes, "
+    ):
         config.build_algo()
 
 

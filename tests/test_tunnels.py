@@ -90,6 +90,17 @@ def test_walls_are_collisions():
     assert metrics["collisions_agents"] == metrics["collisions_obstacles"] == 0.0
 
 
+def test_much_start_noise_leaves_nobody_in_another():
+    env = make_vec("tunnel", num_envs=64, start_noise=2.0)
+    env.reset(seed=0)
+    x = env.world.position[:, :3, 0]
+    assert (x.min(), x.max()) == pytest.approx((-3.0, 1.0), abs=0.1)
+    assert env.world.contacts("agent").sum() == env.world.contacts("obstacle").sum() == 0
+    plain = make_vec("tunnel")
+    plain.reset(seed=0)
+    np.testing.assert_array_equal(env.world.position[:, 3:], np.tile(plain.world.position[:, 3:], (64, 1, 1)))
+
+
 def test_start_noise_moves_agents_alone_and_differs_between_copies():
     env = make_vec("tunnel", num_envs=128, start_noise=0.05)
     still = make_vec("tunnel")

@@ -9,7 +9,7 @@ Agents' rewards differ here, and FACMAC learns the value of one team reward: it 
 Before it starts, the full run measures how fast it is on this machine, and says how long it will take.
 """
 
-from rllib_maobs.experiment import Experiment, decayed
+from rllib_maobs.experiment import Experiment, decayed, fading
 
 experiment = Experiment(
     name="simple-tunnel",
@@ -29,12 +29,12 @@ experiment = Experiment(
             "gamma": 0.95,
             "tau": 0.01,
             "train_batch_size_per_learner": 128,
-            "updates_per_env_step": 1 / 8,
+            "updates_per_env_step": 1 / 2,
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
-            "exploration": {"epsilon": 0.1, "noise": 0.2, "decay": 1e-6, "final": 0.05},
+            "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),
             "env_config": {"action_mode": "force"},
-            "train_horizon": 100,  # the way through the tunnel is long
+            "train_horizon": 60,  # the way through the tunnel is long
             "num_envs_per_env_runner": 32,
             "stop_timesteps": 200_000,
             "quick": {

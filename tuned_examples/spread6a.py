@@ -7,7 +7,7 @@
 Before it starts, the full run measures how fast it is on this machine, and says how long it will take.
 """
 
-from rllib_maobs.experiment import Experiment, decayed
+from rllib_maobs.experiment import Experiment, decayed, fading
 
 experiment = Experiment(
     name="spread-6a",
@@ -30,8 +30,14 @@ experiment = Experiment(
             "updates_per_env_step": 1 / 8,
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
-            "exploration": {"epsilon": 0.1, "noise": 0.2, "decay": 1e-6, "final": 0.05},
+            "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),
             "env_config": {"action_mode": "force"},
+            # Training is stricter with contacts; scores are those of the task's own reward.
+            "train_env_config": {
+                "reward_mode": "mean",
+                "agent_collision_penalty": 3.0,
+                "obstacle_collision_penalty": 3.0,
+            },
             "train_horizon": 25,
             "num_envs_per_env_runner": 32,
             "stop_timesteps": 400_000,

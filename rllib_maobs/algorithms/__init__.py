@@ -17,7 +17,7 @@ for _algorithm in (IDDPG, MADDPG, MADDPGLSTM, MADDPGL, FACMAC, IQL, VDN, QMIX):
 
 
 def support_table() -> str:
-    """What every algorithm is defined for, as a Markdown table; the README's."""
+    """What every algorithm is defined for, as a Markdown table; that of docs/algorithms.md."""
     lines = [
         "| | actions | needs one team reward | agents may differ | LSTM | parameter sharing | twin critics (TD3) |",
         "|---|---|---|---|---|---|---|",

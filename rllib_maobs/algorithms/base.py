@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+import pickle
+from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from pyarrow.fs import FileSystem, FileType
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core import (
+    COMPONENT_LEARNER,
+    COMPONENT_LEARNER_GROUP,
+    COMPONENT_METRICS_LOGGER,
+    COMPONENT_RL_MODULE,
+)
 from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import (
@@ -23,10 +32,11 @@ from ray.rllib.utils.metrics import (
     TIMERS,
 )
 
+from rllib_maobs.algorithms.checks import check_machine
 from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
-from rllib_maobs.paths import AnyPath
+from rllib_maobs.paths import AnyPath, absolute
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raised_as_themselves
 
@@ -44,6 +54,7 @@ class JointAlgorithm(AnyPath, Algorithm):
     """
 
     config_class: ClassVar[type[JointConfig]] = JointConfig
+    config: Any
     replay_buffer: JointReplayBuffer
 
     @classmethod
@@ -54,7 +65,12 @@ class JointAlgorithm(AnyPath, Algorithm):
 
     @override(Algorithm)
     def setup(self, config: AlgorithmConfig) -> None:
-        """Builds the replay buffer and lets local runners act with the learner's own tensors."""
+        """Builds the replay buffer and lets local runners act with the learner's own tensors.
+
+        Raises:
+            ValueError: If this machine lacks what the configuration needs: a GPU, or a compiler.
+        """
+        check_machine(config)
         super().setup(config)
         team: Team = self.config.team
         self._learner: JointLearner = self.learner_group._learner
@@ -181,6 +197,45 @@ class JointAlgorithm(AnyPath, Algorithm):
         if report is not None:
             self.metrics.aggregate([report], key=LEARNER_RESULTS)
 
+    def _follow(self, agents: Sequence[str] | None) -> None:
+        """Builds everything anew if a saved team, whose state is to be taken over, stands in another order.
+
+        Networks of a centralised critic have weights for every agent's place, so the order is taken over with them.
+
+        Raises:
+            ValueError: If its agents are others.
+        """
+        team: Team = self.config.team
+        if agents is None or tuple(agents) == team.agents:
+            return
+        if set(agents) != set(team.agents):
+            raise ValueError(
+                f"The saved team is {sorted(agents)}, but the agents of {self.config.env!r} are "
+                f"{sorted(team.agents)}: a run goes on with the same set of agents only."
+            )
+        config: JointConfig = self.config.copy(copy_frozen=False)
+        config.team = team.ordered(agents)
+        config.validate()
+        config.freeze()
+        self.cleanup()
+        self.config = config
+        self.setup(config)
+
+    @override(Algorithm)
+    def restore_from_path(
+        self, path: str | Path, *args: Any, component: str | None = None, filesystem: Any = None, **kwargs: Any
+    ) -> None:
+        """Goes on from a checkpoint, in the order of agents that it was made in."""
+        if component is None:
+            files, folder = (filesystem, path) if filesystem else FileSystem.from_uri(absolute(path))
+            saved = f"{folder}/{self.CLASS_AND_CTOR_ARGS_FILE_NAME}"
+            if files.get_file_info(saved).type == FileType.File:
+                with files.open_input_stream(saved) as file:
+                    team = pickle.load(file)["ctor_args_and_kwargs"][0][0].get("team")
+                self._follow(None if team is None else team.agents)
+        super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
+        self._send_weights()
+
     @override(Algorithm)
     def get_state(
         self,
@@ -192,6 +247,7 @@ class JointAlgorithm(AnyPath, Algorithm):
         """RLlib's state, the progress of updates against steps and, if wanted, the replay buffer."""
         state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
         state["progress"] = dict(self._progress)
+        state["agents"] = list(self.config.team.agents)
         stored = self.config.store_buffer_in_checkpoints
         if stored and self._check_component(COMPONENT_REPLAY_BUFFER, components, not_components):
             state[COMPONENT_REPLAY_BUFFER] = self.replay_buffer.get_state()
@@ -200,7 +256,12 @@ class JointAlgorithm(AnyPath, Algorithm):
     @override(Algorithm)
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
+        self._follow(state.get("agents"))
+        if COMPONENT_METRICS_LOGGER in state:  # RLlib reads the runners' step count in it before it restores it
+            self.metrics.set_state(state[COMPONENT_METRICS_LOGGER])
         super().set_state(state)
+        if COMPONENT_LEARNER_GROUP in state:
+            self._send_weights()
         if "progress" in state:
             self._progress = dict(state["progress"])
         if COMPONENT_REPLAY_BUFFER in state:
@@ -208,6 +269,51 @@ class JointAlgorithm(AnyPath, Algorithm):
         if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
             starts = self._progress["env_steps"] + self._steps_before_learning()
             self._progress |= {"learning_starts": starts, "updates": 0}
+
+    def _send_weights(self) -> None:
+        """Sends all remote runners the weights; RLlib would not to those to which others are still on their way."""
+        for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None and group.num_remote_workers() > 0:
+                group.sync_weights(
+                    from_worker_or_learner_group=self.learner_group,
+                    timeout_seconds=self.config.sample_timeout_s,
+                    inference_only=True,
+                )
+
+    @override(Algorithm)
+    def set_weights(self, weights: dict[str, dict[str, Any]]) -> None:
+        """Sets the weights of modules, as `get_weights()` gives them, here and in all runners."""
+        self.set_state({COMPONENT_LEARNER_GROUP: {COMPONENT_LEARNER: {COMPONENT_RL_MODULE: weights}}})
+
+    @override(Algorithm)
+    def _before_evaluate(self) -> None:
+        if self.eval_env_runner_group is None:
+            raise ValueError(
+                "evaluate() needs runners of its own: config.evaluation(evaluation_interval=...) or "
+                "(evaluation_num_env_runners=...) makes them. It would reset the training environments, and explore."
+            )
+
+    def _use_modules(self, *args: Any, **kwargs: Any) -> Any:
+        """Takes the place of what RLlib has for policies, of which there are none on its new API stack."""
+        agent = self.config.team.agents[0]
+        raise NotImplementedError(
+            "There are no policies on RLlib's new API stack: take an agent's module, module = "
+            f"algo.get_module({self.config.module_ids[0]!r}), and act with "
+            'module.forward_inference({"obs": obs})["actions"], observations (B, O) to actions (B, A) in [-1, 1]; '
+            f"{agent!r} is the first of the agents."
+        )
+
+    get_policy = compute_single_action = compute_actions = add_policy = remove_policy = _use_modules
+    export_policy_model = export_policy_checkpoint = _use_modules
+
+    def _fixed_team(self, *args: Any, **kwargs: Any) -> Any:
+        """Takes the place of what changes the modules in mid-training."""
+        raise NotImplementedError(
+            "The team's modules are fixed, since they are learned in one stacked update: build an algorithm with "
+            "config.multi_agent(policies=..., policy_mapping_fn=...) for others."
+        )
+
+    add_module = remove_module = _fixed_team
 
     @override(Algorithm)
     def get_checkpointable_components(self) -> list[tuple[str, Checkpointable]]:

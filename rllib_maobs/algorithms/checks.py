@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core import ALL_MODULES
+from ray.rllib.core.rl_module import RLModule, validate_module_id
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.policy.policy import PolicySpec
 
+from rllib_maobs.algorithms import settings
 from rllib_maobs.envs.team import Team, shares_reward
 from rllib_maobs.layout import Layout
+from rllib_maobs.learner import MIXER, JointLearner
 from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, EntityActor, EntityLSTMActor, RecurrentActor
-from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings
+from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings, takes
 from rllib_maobs.modules.exploration import make_exploration
-from rllib_maobs.options import check_value
+from rllib_maobs.options import closest
 from rllib_maobs.runner import JointEnvRunner, make_env
 
 if TYPE_CHECKING:
@@ -38,8 +49,7 @@ def own_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
 
 def check_settings_of(config: JointConfig) -> None:
     """Checks each setting by itself, those that exclude each other, and those of RLlib that joint training needs."""
-    for name, hint in config.legal.items():
-        setattr(config, name, check_value(getattr(config, name), hint, name, type(config).__name__))
+    settings.check_values(config)
     if config.critic_sees not in _CRITICS_SEE:
         raise ValueError(f"critic_sees must be one of {', '.join(map(str, _CRITICS_SEE))}, not {config.critic_sees!r}.")
     for name in ("exploration", "actor_settings", "critic_settings"):
@@ -54,45 +64,34 @@ def check_settings_of(config: JointConfig) -> None:
     if not config.supports.twin_critics and (config.twin_critics or config.target_noise or config.policy_delay > 1):
         legal = "twin_critics=False, target_noise=0.0 and policy_delay=1"
         raise ValueError(f"{config.name} is not defined with TD3's options; legal are {legal}.")
-    if config.num_learners > 0:
-        raise ValueError(
-            f"num_learners must be 0, not {config.num_learners}: a stacked update of all agents runs in the "
-            f"algorithm's process (on its GPU with num_gpus_per_learner=1). Scale out with num_env_runners "
-            f"or with more Tune trials."
-        )
     if not issubclass(config.env_runner_cls or object, JointEnvRunner):
         raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {config.env_runner_cls}: replay is joint.")
-    if not config.normalize_actions:
-        raise ValueError("normalize_actions must be True: the actors' actions are in [-1, 1].")
+    if not issubclass(config.learner_class, JointLearner):
+        raise ValueError(f"learner_class must be a JointLearner, not {config.learner_class}: its losses are joint.")
+    settings.check_known(config)
+    if not config.in_evaluation:
+        settings.check_known(config.get_evaluation_config_object())
 
 
 def check_networks(config: JointConfig) -> None:
     """Checks the networks' classes and their settings."""
-    given = config._model_config
-    for name in given if isinstance(given, dict) else ():
-        if name not in COMMON_SETTINGS:
-            raise ValueError(
-                f"Unknown model_config setting {name!r}; legal are {', '.join(COMMON_SETTINGS)}. Settings of one "
-                f"network alone are training(actor_settings={{...}}) and training(critic_settings={{...}})."
-            )
-    if isinstance(config._rl_module_spec, MultiRLModuleSpec):
-        for policy, spec in config._rl_module_spec.rl_module_specs.items():
-            for name in spec.model_config if isinstance(spec.model_config, dict) else ():
-                if name not in _OF_A_POLICY:
-                    raise ValueError(
-                        f"The RLModuleSpec of policy {policy!r} sets {name!r}; policies may differ in "
-                        f"{', '.join(_OF_A_POLICY)}, everything else is training()'s."
-                    )
-    settings = config.model_config
-    one_of("model_config['activation']", settings.get("activation", "relu"), ACTIVATIONS)
-    hidden = settings.get("hidden_sizes", (64,))
-    if not hidden or not all(isinstance(size, int) and size > 0 for size in hidden):
+    _check_model_config(config._model_config, "model_config", COMMON_SETTINGS)
+    spec = config._rl_module_spec
+    if isinstance(spec, RLModuleSpec):
+        _check_module_spec(config, spec, "The RLModuleSpec")
+    elif isinstance(spec, MultiRLModuleSpec):
+        for policy, own in spec.rl_module_specs.items():
+            _check_module_spec(config, own, f"The RLModuleSpec of policy {policy!r}")
+    model_config = config.model_config
+    one_of("model_config['activation']", model_config.get("activation", "relu"), ACTIVATIONS)
+    hidden = model_config.get("hidden_sizes", (64,))
+    if not isinstance(hidden, list | tuple) or not hidden or not all(_is_size(size) for size in hidden):
         raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
-    cell = settings.get("lstm_cell_size", 64)
-    if not isinstance(cell, int) or cell < 1:
+    cell = model_config.get("lstm_cell_size", 64)
+    if not _is_size(cell):
         raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}.")
     actor = ACTORS.resolve(config.actor)
-    network_settings(actor, settings, config.actor_settings, ACTOR_ARGUMENTS)
+    network_settings(actor, model_config, config.actor_settings, ACTOR_ARGUMENTS)
     if config.normalize_observations and issubclass(actor, EntityActor | EntityLSTMActor):
         raise ValueError(
             f"normalize_observations must be False with {actor.__name__}: it shifts and scales each number on its "
@@ -107,11 +106,50 @@ def check_networks(config: JointConfig) -> None:
         )
     critic = CRITICS.resolve(config.critic)
     if config.critic_sees:
-        network_settings(critic, settings, config.critic_settings, CRITIC_ARGUMENTS)
+        network_settings(critic, model_config, config.critic_settings, CRITIC_ARGUMENTS)
     elif config.critic != "mlp" or config.critic_settings:
         raise ValueError(
             f"{config.name} has no critics, so it takes neither critic ({config.critic!r}) nor critic_settings "
             f"({config.critic_settings!r}): its utilities are the actor."
+        )
+    networks: list[type[Any]] = [actor, critic] if config.critic_sees else [actor]
+    if isinstance(spec, MultiRLModuleSpec):  # policies may have others
+        given = [own.model_config or {} for own in spec.rl_module_specs.values()]
+        networks += [ACTORS.resolve(own["actor"]) for own in given if "actor" in own]
+        networks += [CRITICS.resolve(own["critic"]) for own in given if "critic" in own]
+    names = " and ".join(network.__name__ for network in networks)
+    for name in config._model_config:
+        if not any(takes(network, name) for network in networks):
+            raise ValueError(f"model_config[{name!r}] has no effect: {names} take no such setting.")
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value > 0)
+
+
+def _check_model_config(given: Any, what: str, legal: Collection[str]) -> None:
+    """Raises a ValueError unless it is a dict of settings that policies may have."""
+    if not isinstance(given, dict):
+        raise ValueError(f"{what} must be a dict with some of {', '.join(legal)}, not {given!r}.")
+    for name in given:
+        if name not in legal:
+            raise ValueError(
+                f"{what} sets {name!r}{closest(name, list(legal))}; legal are {', '.join(legal)}. Settings of one "
+                f"network alone are training(actor_settings={{...}}) and training(critic_settings={{...}}), and all "
+                f"else is training()'s."
+            )
+
+
+def _check_module_spec(config: JointConfig, spec: RLModuleSpec, what: str) -> None:
+    """Raises a ValueError if a policy's own module is no `AgentModule`, or has settings that are training()'s."""
+    if spec.model_config is not None:
+        _check_model_config(spec.model_config, what, _OF_A_POLICY)
+    cls = spec.module_class
+    if cls is not None and not issubclass(cls, config.module):
+        missing = [name for name in vars(config.module) if name[0] != "_" and not hasattr(cls, name)]
+        raise ValueError(
+            f"{what} has module_class {cls.__name__}, which lacks {', '.join(missing)} of {config.module.__name__}: "
+            f"derive it from that, or plug in its networks alone by training(actor=..., critic=...)."
         )
 
 
@@ -135,6 +173,11 @@ def inspect_team(config: JointConfig) -> Team:
             )
     finally:
         env.close()
+    decided: Team | None = getattr(config, "team", None)
+    if decided is not None and config.in_evaluation:
+        decided.check(env, f"the evaluation environment {config.env!r}")
+    if decided is not None and set(decided.agents) == set(team.agents):
+        return team.ordered(decided.agents)  # once decided, an order stays
     return team
 
 
@@ -160,8 +203,14 @@ def map_policies(config: JointConfig) -> tuple[str, ...]:
             raise ValueError(f"Agents that share policy {policy!r} must have one observation layout, not {layouts}.")
         if len(spaces) > 1 and not config.supports.parameter_sharing:
             raise ValueError(f"{config.name} is not defined with shared policies; {policy!r} is that of {[*spaces]}.")
-    if config.policies_to_train is not None:
-        raise ValueError("policies_to_train must be None: all agents of the team are trained.")
+    for policy in config.policies:
+        validate_module_id(policy, error=True)  # it names a folder of checkpoints
+        if policy in (MIXER, ALL_MODULES):
+            raise ValueError(
+                f"No policy can be called {policy!r}, which RLlib or this package calls something else: rename the "
+                f"agent, or give agents policies of other names by config.multi_agent(policies=..., "
+                f"policy_mapping_fn=...)."
+            )
     return module_ids
 
 
@@ -179,6 +228,11 @@ def check_team(config: JointConfig) -> None:
         raise ValueError(
             f"{config.name} needs agents with observations and actions of equal size, but those of {config.env} have "
             f"{dict(zip(team.agents, zip(team.observation_sizes, team.action_sizes, strict=True), strict=True))}."
+        )
+    if not team.discrete and config.gumbel_temperature != 1.0:
+        raise ValueError(
+            f"gumbel_temperature must be 1.0, not {config.gumbel_temperature}: the actions of {config.env} are "
+            f"continuous, and it is the softmax's of discrete ones."
         )
     if team.discrete and config.target_noise:
         raise ValueError(
@@ -206,12 +260,38 @@ def check_layouts(config: JointConfig) -> None:
     """Builds every policy's networks once, so that one which can't do with its layout is an error now."""
     if config.mixes and config.mixer_settings() is None:
         raise ValueError(f"{config.name} mixes values (mixes=True), but its mixer_settings() says not how.")
+    built_modules(config)
+
+
+def built_modules(config: JointConfig) -> dict[str, RLModule]:
+    """The modules that a learner would start with, by policy."""
     team = config.team
     spaces = {mid: team.spaces(agent) for agent, mid in zip(team.agents, config.module_ids, strict=True)}
     specs = config.get_multi_rl_module_spec(spaces=spaces).rl_module_specs
     with torch.random.fork_rng(devices=[]):  # the run's own networks start as if there had been no check
-        for spec in specs.values():
-            spec.build()
+        return {mid: spec.build() for mid, spec in specs.items()}
+
+
+def check_machine(config: AlgorithmConfig) -> None:
+    """Checks that the machine of the learner has what the configuration asks for; the others need not."""
+    if config.num_gpus_per_learner > 0 and not torch.cuda.is_available():
+        raise ValueError(
+            f"num_gpus_per_learner must be 0 where PyTorch finds no GPU, not {config.num_gpus_per_learner}: "
+            f"torch.cuda.is_available() is False."
+        )
+    if config.torch_compile_learner and config.torch_compile_learner_dynamo_backend == "inductor":
+        check_compiler()
+
+
+def check_compiler() -> None:
+    """Checks that there is the C++ compiler that `torch.compile` calls."""
+    given = os.environ.get("CXX") or {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++")
+    if shutil.which(shlex.split(given)[0]) is None:
+        raise ValueError(
+            f"Compiled updates need a C++ compiler, and there is no {given!r} on the PATH: install one (apt install "
+            f"g++, or conda install gxx), or go without by framework(torch_compile_learner=False), which is "
+            f"--no-compile of the example scripts: the same numbers, several times slower."
+        )
 
 
 def agent_groups(config: JointConfig, state: Layout) -> list[tuple[str, int]]:

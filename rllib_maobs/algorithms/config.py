@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
@@ -12,23 +12,17 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.utils.annotations import override
 from ray.util import log_once
 
-from rllib_maobs.algorithms import checks
+from rllib_maobs.algorithms import checks, settings
 from rllib_maobs.envs.team import Team
 from rllib_maobs.layout import Entities, Layout, layout_size
 from rllib_maobs.learner import MIXER, JointLearner
 from rllib_maobs.modules import ACTORS, CRITICS, EXPLORATIONS, Actor, AgentModule, Critic, MixerModule, RecurrentActor
-from rllib_maobs.options import Range
 from rllib_maobs.runner import JointEnvRunner
-
-PositiveInt = Annotated[int, Range(1)]
-NonNegativeInt = Annotated[int, Range(0)]
-Positive = Annotated[float, Range(0.0, exclusive=True)]
-NonNegative = Annotated[float, Range(0.0)]
 
 
 @dataclass(frozen=True)
 class Supports:
-    """What an algorithm is defined for; validation, the README's table and the tests follow it.
+    """What an algorithm is defined for; validation, the docs' table and the tests follow it.
 
     Attributes:
         actions: Kinds of action spaces, of "continuous" and "discrete".
@@ -72,33 +66,7 @@ class JointConfig(AlgorithmConfig):
     learner: ClassVar[type[JointLearner]] = JointLearner
     module: ClassVar[type[AgentModule]] = AgentModule
     default_exploration: ClassVar[dict[str, Any]] = {}
-    legal: ClassVar[dict[str, Any]] = {
-        "actor_lr": Positive | list,
-        "critic_lr": Positive | list,
-        "gamma": Annotated[float, Range(0.0, 1.0)],
-        "tau": Annotated[float, Range(0.0, 1.0, exclusive=True)],
-        "train_batch_size_per_learner": PositiveInt,
-        "replay_buffer_capacity": PositiveInt,
-        "num_envs_per_env_runner": PositiveInt,
-        "updates_per_env_step": NonNegative,
-        "critic_state": Literal["observations", "world"],
-        "seq_length": PositiveInt,
-        "stored_state": bool,
-        "n_step": PositiveInt,
-        "twin_critics": bool,
-        "policy_delay": PositiveInt,
-        "target_noise": NonNegative,
-        "target_noise_clip": NonNegative,
-        "action_regularization": NonNegative,
-        "gumbel_temperature": Positive,
-        "normalize_observations": bool,
-        "reward_scale": Positive,
-        "agent_id_input": bool,
-        "grad_clip": Positive | None,
-        "num_random_steps": NonNegativeInt,
-        "num_steps_sampled_before_learning_starts": NonNegativeInt,
-        "store_buffer_in_checkpoints": bool,
-    }
+    legal: ClassVar[dict[str, Any]] = settings.LEGAL
     ties_critics: bool = False
     team: Team
     module_ids: tuple[str, ...]
@@ -248,11 +216,18 @@ class JointConfig(AlgorithmConfig):
         """
         if "carry_hidden" in kwargs:
             raise ValueError("carry_hidden is now called stored_state (Kapturowski et al. 2019's term).")
+        settings.check_arguments(self, kwargs)
         super().training(**kwargs)
         given = {k: v for k, v in locals().items() if k not in ("self", "kwargs", "__class__")}
         for name, value in given.items():
             if value is not NotProvided:
                 setattr(self, name, value)
+        return self
+
+    @override(AlgorithmConfig)
+    def env_runners(self, **kwargs: Any) -> Self:
+        """RLlib's, which would not take NumPy's numbers."""
+        super().env_runners(**{name: settings.plain(value) for name, value in kwargs.items()})
         return self
 
     @override(AlgorithmConfig)

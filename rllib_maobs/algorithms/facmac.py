@@ -32,7 +32,7 @@ class FACMACLearner(JointLearner):
             q = online.q(batch.now, batch.actions)[..., 0]  # (B, N)
         else:
             next_q = self.total(target, batch.next, next_actions)  # (B, M)
-            y = (batch.rewards[:, :1] + batch.discount * next_q).detach()  # (B, M)
+            y = (batch.rewards[:, :1] + batch.team_discount * next_q).detach()  # (B, M)
             q = self.total(online, batch.now, batch.actions)  # (B, M)
         return (y - q).square().mean(0), q
 
@@ -83,7 +83,8 @@ class FACMACConfig(JointConfig):
     `mixer_start` makes two stages of it (figure 7): until that many env steps local critics and actors learn alone
     (eq. 13), and the mixer stands still; then eq. 14.
 
-    There is one value of the team, so it needs one team reward.
+    There is one value of the team, so it needs one team reward. Its target bootstraps unless all agents terminated
+    (`Batch.team_discount`); those of the local critics before `mixer_start` bootstrap by each agent's own flag.
     """
 
     name = "facmac"

@@ -31,7 +31,9 @@ class QLearner(JointLearner):
         best = target.legal(judge).argmax(-1, keepdim=True)  # (B, N, 1)
         next_q = next_q.gather(-1, best).squeeze(-1)  # (B, N)
         total, next_total = self.total(online, q, batch.now), self.total(target, next_q, batch.next)
-        y = (batch.rewards[:, : total.shape[1]] + batch.discount * next_total).detach()  # (B, N) or (B, 1)
+        # One value of the team goes on until all agents terminate.
+        discount = batch.discount if total.shape[1] == next_q.shape[1] else batch.team_discount
+        y = (batch.rewards[:, : total.shape[1]] + discount * next_total).detach()  # (B, N) or (B, 1)
         return (y - total).square().mean(0), total
 
     def total(self, nets: TeamNetworks, q: Tensor, moment: Moment) -> Tensor:

@@ -7,20 +7,60 @@ environment lists its agents.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from functools import partial
+from inspect import signature
 from typing import Any
+from weakref import WeakValueDictionary
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import flatdim
+from ray.rllib.env.env_context import EnvContext
 from ray.tune.registry import register_env
 
 from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
 from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
 from rllib_maobs.layout import Entities, Layout, flat
+
+
+class InOrder:
+    """An environment whose agents stand in another order in all arrays.
+
+    Args:
+        env: The environment.
+        agents: Its agents, in the new order.
+    """
+
+    def __init__(self, env: JointEnv, agents: Sequence[str]) -> None:
+        self._env = env
+        self.num_envs, self.agents = env.num_envs, list(agents)
+        self.observation_spaces, self.action_spaces = env.observation_spaces, env.action_spaces
+        for name in ("observation_layouts", "state_layout", "shared_reward"):
+            setattr(self, name, getattr(env, name, None))
+        self._ours = [env.agents.index(agent) for agent in agents]
+        self._theirs = [self.agents.index(agent) for agent in env.agents]
+
+    def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
+        """Resets all copies, or those of `mask`."""
+        obs, info = self._env.reset(seed=seed, mask=mask)
+        return obs[:, self._ours], info
+
+    def step(self, actions: Float) -> StepResult:
+        """Steps every copy."""
+        obs, rewards, terminated, truncated, info = self._env.step(actions[:, self._theirs])
+        terminated = terminated if terminated.ndim == 1 else terminated[:, self._ours]
+        return obs[:, self._ours], rewards[:, self._ours], terminated, truncated, info
+
+    def state(self, kind: str | None = None) -> Float:
+        """The environment's own state `(E, S)`, as it is."""
+        return self._env.state(kind)
+
+    def close(self) -> None:
+        """Closes every copy."""
+        self._env.close()
 
 
 class WithAgentIds:
@@ -99,8 +139,10 @@ def _make_scenario_env(cls: type[Any], preset: Mapping[str, Any], context: Mappi
     return MAObsEnv({"scenario": cls, **preset, **context})
 
 
-def make_joint_env(creator: Callable[[Any], Any], context: Any, num_envs: int) -> JointEnv:
+def make_joint_env(creator: Callable[[Any], Any], context: Mapping[str, Any], num_envs: int) -> JointEnv:
     """E copies of what an RLlib environment creator makes.
+
+    Every copy is made from a deep copy of the context of its own, with its `vector_index`.
 
     Args:
         creator: Function of an `EnvContext` that returns a `MultiAgentEnv` or a `ParallelEnv`.
@@ -111,17 +153,60 @@ def make_joint_env(creator: Callable[[Any], Any], context: Any, num_envs: int) -
         The copies, behind one array interface.
 
     Raises:
-        ValueError: If what the creator returns is not a multi-agent environment with a list of agents.
+        ValueError: If what the creator returns is not a multi-agent environment with a list of agents, or the same
+            object twice.
     """
-    env = creator(context)
+    env = creator(_own_context(context, 0))
     if hasattr(env, "make_vec"):
         joint: JointEnv = env.make_vec(num_envs)
         return joint
-    return StackedEnv([env, *(creator(context) for _ in range(num_envs - 1))])
+    envs = [env, *(creator(_own_context(context, copy)) for copy in range(1, num_envs))]
+    for copy, one in enumerate(envs):
+        same = [_innermost(other) is _innermost(one) for other in envs[:copy]]
+        if any(same):
+            shared = f"copies {same.index(True)} and {copy} of {_name_of(env)} are"
+        elif id(_innermost(one)) in _stepped:
+            shared = f"copy {copy} of {_name_of(env)} and one of another runner (of evaluation, or not stopped) are"
+        else:
+            continue
+        raise ValueError(f"Environment {shared} one object: the environment's creator must return a new one each time.")
+    stacked = StackedEnv(envs)
+    _stepped.update({id(_innermost(one)): stacked for one in envs})
+    return stacked
+
+
+# Which environment objects of this process are being stepped, by id, and by whom.
+_stepped: WeakValueDictionary[int, StackedEnv] = WeakValueDictionary()
+
+
+def _own_context(context: Mapping[str, Any], copy: int) -> Any:
+    """What one copy is made from: whatever its constructor does to it, the others do not see."""
+    own: Any = deepcopy(context)
+    if isinstance(own, EnvContext):
+        own.vector_index = copy
+    return own
+
+
+def _innermost(env: Any) -> Any:
+    """The environment inside of wrappers, of PettingZoo's, RLlib's and Gymnasium's kind."""
+    for name in ("env", "par_env", "aec_env"):
+        inner = getattr(env, name, None)
+        if hasattr(inner, "reset") and hasattr(inner, "step"):
+            return _innermost(inner)
+    return env
+
+
+def _name_of(env: Any) -> str:
+    """What messages call a dict-speaking environment: its class, inside of wrappers."""
+    return type(_innermost(env)).__name__
 
 
 class StackedEnv:
     """Copies of a dict-speaking multi-agent environment, stacked to arrays.
+
+    What they return is checked at every step. Whether an agent was terminated or truncated its own flag says; those
+    without one follow `__all__`. An environment that empties its list `agents` has ended its episode, too: agents
+    without any flag were truncated then.
 
     Attributes:
         envs: The copies.
@@ -132,21 +217,38 @@ class StackedEnv:
         envs: The copies: RLlib `MultiAgentEnv`s or PettingZoo `ParallelEnv`s.
 
     Raises:
-        ValueError: If the environment does not list its `possible_agents`.
+        ValueError: If the environment does not list its `possible_agents`, is not parallel, or has no seeded reset.
     """
 
     def __init__(self, envs: Sequence[Any]) -> None:
         env = envs[0]
         self.num_envs = len(envs)
+        self._name = _name_of(env)
+        if hasattr(env, "agent_iter"):
+            raise ValueError(
+                f"{self._name} is an AEC environment, whose agents act in turns; legal are RLlib MultiAgentEnvs and "
+                f"PettingZoo ParallelEnvs: use its parallel_env(), or pettingzoo.utils.aec_to_parallel(env)."
+            )
         self.agents: list[str] = list(getattr(env, "possible_agents", None) or [])
         if not self.agents:
             raise ValueError(
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
                 f"with a fixed team."
             )
+        try:
+            signature(env.reset).bind(seed=0)
+        except TypeError as error:
+            raise ValueError(f"{self._name}.reset() takes no seed ({error}); legal: reset(seed=None).") from None
+        for copy, other in enumerate(envs):
+            if set(theirs := list(other.possible_agents)) != set(self.agents):
+                raise ValueError(
+                    f"The agents of {self._name} are {self.agents} in copy 0, but {theirs} in copy {copy}: legal is "
+                    f"the same set of agents in all copies."
+                )
         self.envs = list(envs)
         self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
+        self._listed = np.zeros(self.num_envs, dtype=np.bool_)  # which ones say in `agents` who is there
         self._obs: Float | None = None
         # RLlib calls them get_observation_space(agent), PettingZoo observation_space(agent).
         self.observation_spaces, self.action_spaces = (
@@ -155,49 +257,70 @@ class StackedEnv:
         )
         self.observation_spaces = {a: space(a) for a, space in self.observation_spaces.items()}
         self.action_spaces = {a: space(a) for a, space in self.action_spaces.items()}
-        self._size = max(flatdim(space) for space in self.observation_spaces.values())
+        self._sizes = {a: int(np.prod(space.shape or ())) for a, space in self.observation_spaces.items()}
+        self._size = max(self._sizes.values())
         self.observation_layouts: Mapping[str, Groups | None] | None = getattr(env, "observation_layouts", None)
         self.state_layout: Groups | None = getattr(env, "state_layout", None)
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
-        """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`."""
+        """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`.
+
+        Raises:
+            ValueError: If `reset` does not take a seed, or what it returns is not legal; names copy and agent.
+        """
         if isinstance(seed, int):
             seed = [seed + copy for copy in range(self.num_envs)]
         for copy in range(self.num_envs):
             if mask is not None and not mask[copy]:
                 continue
-            obs, infos = self.envs[copy].reset(seed=None if seed is None else seed[copy])
-            self._infos[copy] = infos or {}
-            rows = self._stack(obs, copy)
+            self._steps[copy] = 0
+            result = self.envs[copy].reset(seed=None if seed is None else seed[copy])
+            if not _are(result, (Mapping, Mapping | None)):
+                raise self._error(copy, f"reset() returns {_kinds(result)}", "two dicts by agent: observations, infos")
+            self._infos[copy] = result[1] or {}
+            rows = self._stack(result[0], copy)
             if self._obs is None:
                 self._obs = np.zeros((self.num_envs, *rows.shape), dtype=np.float32)
             self._obs[copy] = rows
-            self._steps[copy] = 0
+            self._listed[copy] = bool(getattr(self.envs[copy], "agents", None))
         assert self._obs is not None
         return self._obs.copy(), {"infos": list(self._infos)}
 
     def step(self, actions: Float) -> StepResult:
-        """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`."""
+        """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`.
+
+        Returns:
+            As `JointEnv.step`, terminated `(E, N)`.
+
+        Raises:
+            ValueError: If what it returns is not legal, or some agents end before the others; names copy, step and
+                agent.
+        """
         assert self._obs is not None
         rewards = np.zeros(actions.shape[:2], dtype=np.float32)
-        terminated, truncated = np.zeros((2, self.num_envs), dtype=np.bool_)
+        terminated = np.zeros(actions.shape[:2], dtype=np.bool_)
+        truncated = np.zeros(self.num_envs, dtype=np.bool_)
         metrics: dict[str, Float] = {}
         for copy, env in enumerate(self.envs):
             joint = {
                 agent: self._action(self.action_spaces[agent], action)
                 for agent, action in zip(self.agents, actions[copy], strict=True)
             }
-            obs, reward, terminations, truncations, infos = env.step(joint)
+            result = env.step(joint)
             self._steps[copy] += 1
+            if not _are(result, (*[Mapping] * 4, Mapping | None)):
+                legal = "five dicts by agent: observations, rewards, terminated, truncated, infos"
+                raise self._error(copy, f"step() returns {_kinds(result)}", legal)
+            obs, reward, terminations, truncations, infos = result
             self._infos[copy] = infos = infos or {}
             self._obs[copy] = self._stack(obs, copy)
-            rewards[copy] = [reward[agent] for agent in self.agents]
-            terminated[copy] = self._all(terminations)
-            truncated[copy] = not terminated[copy] and self._all(
-                {a: terminations.get(a) or truncations.get(a) for a in [*self.agents, "__all__"]}
-            )
-            if terminated[copy] or truncated[copy]:
-                for name, value in infos.get(self.agents[0], {}).get("episode_metrics", {}).items():
+            rewards[copy] = self._rewards(reward, copy)
+            over = self._flags(terminations, truncations, copy)
+            if over is not None:
+                terminated[copy] = over
+                truncated[copy] = not over.all()
+                info = infos.get(self.agents[0]) or {}  # None is taken as empty: it says nothing
+                for name, value in info.get("episode_metrics", {}).items():
                     metrics.setdefault(name, np.full(self.num_envs, np.nan, dtype=np.float32))[copy] = value
         return (
             self._obs.copy(),
@@ -207,25 +330,56 @@ class StackedEnv:
             {"infos": list(self._infos), **({"episode_metrics": metrics} if metrics else {})},
         )
 
-    def _all(self, flags: Mapping[str, Any]) -> bool:
-        return bool(flags.get("__all__")) or all(flags.get(agent) for agent in self.agents)
+    def _error(self, copy: int, what: str, legal: str) -> ValueError:
+        where = f"environment copy {copy} at step {self._steps[copy]} of its episode"
+        return ValueError(f"{self._name}: {what} in {where}; legal: {legal}.")
+
+    def _flags(self, terminations: Mapping[str, Any], truncations: Mapping[str, Any], copy: int) -> Bool | None:
+        """Which agents terminated `(N,)` if the episode is over (the others were truncated), or None if it goes on."""
+        terminated, truncated = (
+            np.array([bool(flags.get(agent)) for agent in self.agents]) for flags in (terminations, truncations)
+        )
+        ended, everybody = terminated | truncated, bool(terminations.get("__all__"))
+        emptied = self._listed[copy] and not self.envs[copy].agents
+        if ended.all() or everybody or truncations.get("__all__") or emptied:
+            return terminated | (everybody & ~truncated)
+        if ended.any():
+            gone = [agent for agent, over in zip(self.agents, ended, strict=True) if over]
+            raise self._error(copy, f"the team changed: {gone} ended, others go on", "agents that end in the same step")
+        return None
+
+    def _rewards(self, reward: Mapping[str, Any], copy: int) -> list[float]:
+        """Every agent's reward."""
+        row = []
+        for agent in self.agents:
+            value: Any = reward.get(agent, "missing")
+            try:
+                if np.ndim(value):
+                    raise TypeError
+                row.append(float(value))
+            except (TypeError, ValueError):
+                what = f"the reward of agent {agent!r} is {value!r}"
+                raise self._error(copy, what, "one number for each agent") from None
+        return row
 
     def _stack(self, obs: Mapping[str, Any], copy: int) -> Float:
         if set(obs) != set(self.agents):
             missing, extra = sorted(set(self.agents) - set(obs)), sorted(set(obs) - set(self.agents))
             raise ValueError(
-                f"The team changed in environment copy {copy} at step {self._steps[copy]}: missing agents "
-                f"{missing}, unexpected agents {extra}. Joint learning needs all of {self.agents} in every "
+                f"{self._name}: the team changed in environment copy {copy} at step {self._steps[copy]}: missing "
+                f"agents {missing}, unexpected agents {extra}. Joint learning needs all of {self.agents} in every "
                 f"observation from reset to the end of the episode."
             )
         rows = np.zeros((len(self.agents), self._size), dtype=np.float32)
         for row, agent in zip(rows, self.agents, strict=True):
-            own = np.asarray(obs[agent], dtype=np.float32).reshape(-1)
-            if own.size != flatdim(self.observation_spaces[agent]):
-                raise ValueError(
-                    f"The observation of agent {agent!r} has {own.size} numbers in environment copy {copy} at step "
-                    f"{self._steps[copy]}; its space is {self.observation_spaces[agent]}."
-                )
+            try:
+                own = np.asarray(obs[agent], dtype=np.float32).reshape(-1)
+            except (TypeError, ValueError) as error:
+                what = f"the observation of agent {agent!r} is no array of numbers ({error})"
+                raise self._error(copy, what, f"what is in its space {self.observation_spaces[agent]}") from None
+            if own.size != self._sizes[agent]:
+                what = f"the observation of agent {agent!r} has {own.size} numbers"
+                raise self._error(copy, what, f"what is in its space {self.observation_spaces[agent]}")
             row[: own.size] = own
         return rows
 
@@ -240,21 +394,39 @@ class StackedEnv:
         """The environments' own `state()`, `(E, S)`.
 
         Raises:
-            ValueError: If they have none.
+            ValueError: If they have none, or it changes its size or is not finite; names copy and step.
         """
-        if not hasattr(self.envs[0], "state"):
-            raise ValueError(f'{self.envs[0]} has no state(): use critic_state="observations".')
-        return np.stack([np.asarray(env.state(), dtype=np.float32).reshape(-1) for env in self.envs])
+        rows: list[Float] = []
+        for copy, env in enumerate(self.envs):
+            try:
+                row = np.asarray(env.state(), dtype=np.float32).reshape(-1)
+            except (AttributeError, NotImplementedError) as error:
+                raise ValueError(
+                    f"{self._name} has no state() of its own ({type(error).__name__}: {error}): use "
+                    f'critic_state="observations", or define it in the environment.'
+                ) from error
+            if rows and row.size != rows[0].size:
+                raise self._error(copy, f"the state has {row.size} numbers", f"{rows[0].size}, as in copy 0")
+            if not np.isfinite(row).all():
+                index = int(np.flatnonzero(~np.isfinite(row))[0])
+                raise self._error(copy, f"number {index} of the state is {row[index]}", "finite numbers")
+            rows.append(row)
+        return np.stack(rows)
 
     def close(self) -> None:
         """Closes every copy."""
         for env in self.envs:
+            _stepped.pop(id(_innermost(env)), None)
             env.close()
 
 
-def snapshot(env: JointEnv) -> bytes | None:
-    """An environment in the middle of its episodes as bytes, or None if it cannot be pickled."""
-    try:
-        return pickle.dumps(env)
-    except Exception:
-        return None
+def _are(result: Any, kinds: Sequence[Any]) -> bool:
+    """Whether a method returned a tuple of these kinds."""
+    return isinstance(result, tuple) and len(result) == len(kinds) and all(map(isinstance, result, kinds))
+
+
+def _kinds(result: Any) -> str:
+    """What a method returned, in a few words."""
+    if not isinstance(result, tuple):
+        return f"a {type(result).__name__}"
+    return f"{len(result)} values ({', '.join(type(part).__name__ for part in result)})"

@@ -12,6 +12,7 @@ from rllib_maobs.envs.registry import make_scenario
 from rllib_maobs.envs.rendering import FRAMES_PER_SECOND, RENDER_MODES, Frame
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.envs.single import ByAgent, SingleCopy
+from rllib_maobs.envs.vector import VectorEnv
 from rllib_maobs.layout import Entities, Layout, layout_size
 
 
@@ -51,6 +52,11 @@ class MAObsParallelEnv(ParallelEnv):
         self.state_layout: Layout = env.state_layout if scenario.options.state == "world" else rows
         low_high = np.full(env.state_size(), np.inf, np.float32)
         self.state_space = gym.spaces.Box(-low_high, low_high, dtype=np.float32)
+
+    @property
+    def vector(self) -> VectorEnv:
+        """The one copy behind this face, as arrays."""
+        return self._copy.env
 
     def observation_space(self, agent: str) -> gym.Space[Any]:
         """Return the observation space of an agent."""

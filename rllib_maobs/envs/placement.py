@@ -20,10 +20,11 @@ class Placement:
 
     Args:
         names: Name of each of the K bodies, for messages.
-        half_width: (K,) bodies are drawn in the square [-half_width, half_width]^2.
+        half_width: (K,) bodies are drawn in the square [-half_width, half_width]^2; with 0 they have a fixed place.
         room: (K,) radius that each body keeps free around it.
         clearance: Extra distance between two bodies.
         exclusive: Sets of body numbers; bodies of one set do not overlap. None at all: no check.
+        centre: (K, 2) of the squares; None for the origin.
 
     Raises:
         ValueError: If a set needs more area than there is.
@@ -36,17 +37,22 @@ class Placement:
         room: ArrayLike,
         clearance: float = 0.0,
         exclusive: Sequence[Sequence[int]] = (),
+        centre: ArrayLike | None = None,
     ) -> None:
         self.names = list(names)
+        self._centre = None if centre is None else np.asarray(centre, np.float64)
         self.half_width: FloatArray = np.asarray(half_width, np.float64)
         self.room: FloatArray = np.asarray(room, np.float64)
         separation = np.zeros((len(self.names), len(self.names)))
         for members in exclusive:
             each = np.asarray(members, np.intp)
             separation[np.ix_(each, each)] = self.room[each, None] + self.room[each] + clearance
-            self._check_area(each, clearance)
+            if centre is None:
+                self._check_area(each, clearance)
         np.fill_diagonal(separation, 0.0)
         self._separation = separation
+        # Of two bodies that overlap the later one is drawn again, but never one with a fixed place.
+        self._rank = np.where(self.half_width > 0.0, np.arange(len(self.names)), -1)
 
     def sample(self, rngs: Sequence[Generator]) -> FloatArray:
         """Draw one layout per generator.
@@ -69,6 +75,8 @@ class Placement:
             for row, copy in enumerate(active.tolist()):
                 rngs[copy].random(out=draw[row])
             draw = (2.0 * draw - 1.0) * self.half_width[:, None]
+            if self._centre is not None:
+                draw += self._centre
             current = np.where(redraw[active, :, None], draw, position[active])
             position[active] = current
             overlaps = self._losers(current, redraw[active])
@@ -98,7 +106,8 @@ class Placement:
         squared += offset.imag**2
         pair, other = np.nonzero(squared < self._separation[body] ** 2)
         losers = np.zeros(moved.shape, bool)
-        losers[copy[pair], np.maximum(body[pair], other)] = True
+        first = body[pair]
+        losers[copy[pair], np.where(self._rank[first] > self._rank[other], first, other)] = True
         return losers
 
     @staticmethod
@@ -131,18 +140,19 @@ class Placement:
 
 
 class FixedLayout:
-    """The same positions in every episode, but for an optional jitter of the first bodies.
+    """The same positions in every episode, but for optional noise of the first bodies.
 
     Args:
         names: Name of each of the K bodies, for messages.
         position: (K, 2).
         room: (K,) radius that each body keeps free around it.
         exclusive: Sets of body numbers; bodies of one set do not overlap.
-        noise: Bodies start uniformly within this distance of their place, along x and along y.
+        noise: Bodies start uniformly within this distance of their place, along x and along y; those that would
+            overlap are drawn again.
         num_noisy: How many bodies, from the first, the noise moves.
 
     Raises:
-        ValueError: If bodies of a set overlap, or may do so with noise; names them and the missing room.
+        ValueError: If bodies of a set overlap; names them and the missing room.
     """
 
     def __init__(
@@ -155,18 +165,18 @@ class FixedLayout:
         num_noisy: int = 0,
     ) -> None:
         self.position: FloatArray = np.asarray(position, np.float64)
-        self.noise, self.num_noisy = noise, num_noisy
         distance, radius = Placement._distances(self.position[None])[0], np.asarray(room, np.float64)
-        moves = np.where(np.arange(len(names)) < num_noisy, np.sqrt(2.0) * noise, 0.0)
         for members in exclusive:
             for k, first in enumerate(members):
                 for second in members[k + 1 :]:
-                    missing = radius[first] + radius[second] + moves[first] + moves[second] - distance[first, second]
+                    missing = radius[first] + radius[second] - distance[first, second]
                     if missing > 1e-9:
                         raise ValueError(
                             f"{names[first]} and {names[second]} do not fit: {missing:.3f} of room is missing between "
-                            f"them; use smaller bodies, wider spacing, or less noise"
+                            f"them; use smaller bodies, or wider spacing"
                         )
+        half_width = np.where(np.arange(len(names)) < num_noisy, noise, 0.0)
+        self._noisy = Placement(names, half_width, room, 0.0, exclusive, self.position) if noise > 0.0 else None
 
     def sample(self, rngs: Sequence[Generator]) -> FloatArray:
         """Return one layout per generator.
@@ -177,8 +187,6 @@ class FixedLayout:
         Returns:
             (len(rngs), K, 2) positions.
         """
-        position = np.tile(self.position, (len(rngs), 1, 1))
-        if self.noise > 0.0:
-            for e, rng in enumerate(rngs):
-                position[e, : self.num_noisy] += rng.uniform(-self.noise, self.noise, (self.num_noisy, 2))
-        return position
+        if self._noisy is not None:
+            return self._noisy.sample(rngs)
+        return np.tile(self.position, (len(rngs), 1, 1))

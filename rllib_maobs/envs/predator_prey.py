@@ -136,6 +136,10 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
         self._prey_layout: Layout = (*common, Entities("predator", n, 2, position=2))
         self._others = others(n, num_bodies)
 
+    def resized(self, num_agents: int) -> dict[str, Any]:
+        """Return the options for another number of predators; a learned prey is one of the agents."""
+        return {"num_predators": num_agents - (self.options.prey == "learned")}
+
     def bodies(self) -> Sequence[Bodies]:
         """Return predators, prey, obstacles."""
         o = self.options

@@ -168,6 +168,21 @@ class Scenario(ABC, Generic[OptionsT]):
         options = ", ".join(f"{name}={value!r}" for name, value in asdict(self.options).items())
         return f"{type(self).__name__}({options})"
 
+    def resized(self, num_agents: int) -> dict[str, Any]:
+        """Return the options of this task for a team of another size.
+
+        A scenario where obstacles or room go with the size of the team overrides this.
+
+        Args:
+            num_agents: N.
+
+        Raises:
+            ValueError: If the scenario has no option num_agents.
+        """
+        if not hasattr(self.options, "num_agents"):
+            raise ValueError(f"{type(self).__name__} has teams of one size: it has no option num_agents")
+        return {"num_agents": num_agents}
+
     @abstractmethod
     def bodies(self) -> Sequence[Bodies]:
         """Return the groups of bodies, in the order agents, scripted bodies, obstacles, targets.

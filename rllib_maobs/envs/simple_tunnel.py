@@ -76,8 +76,8 @@ class SimpleTunnel(Scenario[SimpleTunnelOptions]):
         start_distance: Distance of the front column of agents from the gap. [our choice: 1; 0.95 with 6 agents]
         target_distance: Distance of the near column of targets from the gap. [our choice: 1; 0.95 with 6 agents]
         spacing: Distance of neighbours in a column. [our choice: 0.3]
-        start_noise: Agents start uniformly within this distance of their place, along x and along y. [our choice:
-            0, as in the paper]
+        start_noise: Agents start uniformly within this distance of their place, along x and along y; those that would
+            overlap are drawn again. [our choice: 0, as in the paper]
         num_columns: Columns in which agents and targets stand. [our choice: 1; 2 with 6 agents]
         column_spacing: Distance of the columns. [our choice: 0.25]
         wall_x: Walls stand at -wall_x and wall_x. [our choice: 1.4]

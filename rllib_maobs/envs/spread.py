@@ -101,6 +101,21 @@ class Spread(Coverage[SpreadOptions]):
             exclusive=[[*agents, *obstacles], [*obstacles, *targets]] if o.placement == "separated" else [],
         )
 
+    def resized(self, num_agents: int) -> dict[str, Any]:
+        """Return the options for another team: obstacles in proportion, and room, so that it is never more crowded.
+
+        The limit is nine agents of radius 0.15 in the usual room, so `spread-3a` resized to six and nine agents is
+        `spread-6a` and `spread-9a`.
+        """
+        o = self.options
+        room = max(o.agent_range, o.agent_radius / 0.15 * np.sqrt(num_agents / 9))
+        return {
+            "num_agents": num_agents,
+            "num_obstacles": round(o.num_obstacles * num_agents / o.num_agents),
+            "agent_range": float(room),
+            "obstacle_range": float(o.obstacle_range * room / o.agent_range),
+        }
+
     def bodies(self) -> Sequence[Bodies]:
         """Return agents, obstacles, targets."""
         return self._make_bodies(self.options.num_obstacles)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -39,7 +40,8 @@ class JointEnv(Protocol):
     def step(self, actions: Float) -> StepResult:
         """Steps all copies by `(E, N, A)`, or by the numbers `(E, N)` of discrete actions.
 
-        Returns observations, rewards `(E, N)`, terminated, truncated `(E,)`, info.
+        Returns observations, rewards `(E, N)`, terminated, truncated `(E,)`, info. Where agents end differently,
+        terminated says it of each, `(E, N)`, and truncated whether a time limit ended the episode for the others.
         """
 
     def state(self, kind: str | None = None) -> Float:
@@ -57,7 +59,9 @@ class Team:
     fit into arrays `(..., N, O)` and `(..., N, A)`. A discrete action is a one-hot vector in those arrays.
 
     Attributes:
-        agents: Agent ids in the environment's order: the order of every N axis.
+        agents: Agent ids in the order of every N axis, whatever order an environment lists them in: that of their
+            names ("agent_2" before "agent_10"), which is the same in every process. An environment that says what
+            its state is made of keeps its own order: that layout names agents by their places.
         observation_spaces: Every agent's observation space.
         action_spaces: Every agent's action space: all bounded vectors, or all Discrete.
         observation_layouts: What every agent's observation is made of; one group "observation" where that is unknown.
@@ -114,6 +118,39 @@ class Team:
         index = self.agents.index(agent)
         return self.observation_spaces[index], self.action_spaces[index]
 
+    def ordered(self, agents: Sequence[str]) -> Team:
+        """The same team in the order of `agents`, which are the same ids."""
+        order = [self.agents.index(agent) for agent in agents]
+        permuted: dict[str, Any] = {
+            name: tuple(getattr(self, name)[i] for i in order)
+            for name in ("agents", "observation_spaces", "action_spaces", "observation_layouts")
+        }
+        return replace(self, **permuted)
+
+    def check(self, env: JointEnv, name: str) -> None:
+        """Checks that an environment is one of this team's, though it may list its agents in another order.
+
+        Args:
+            env: The environment.
+            name: What to call it.
+
+        Raises:
+            ValueError: If its agents are others, or have other spaces.
+        """
+        if set(env.agents) != set(self.agents):
+            raise ValueError(
+                f"The agents of {name} are {sorted(env.agents)}, but the team is {sorted(self.agents)}: legal is the "
+                f"same set of agents, in any order, in every runner, in evaluation and after a restore."
+            )
+        for agent in self.agents:
+            observation, action = self.spaces(agent)
+            seen, acted = env.observation_spaces[agent], env.action_spaces[agent]
+            if seen.shape != observation.shape or acted != action:
+                raise ValueError(
+                    f"The spaces of agent {agent!r} in {name} are {seen} and {acted}, but in the team {observation} "
+                    f"and {action}: legal are observations of the same size and the same actions."
+                )
+
     @classmethod
     def of(
         cls,
@@ -137,6 +174,8 @@ class Team:
                 not add up or belongs to no agent; says which and what is legal.
         """
         agents = tuple(env.agents)
+        if state_layout is None and getattr(env, "state_layout", None) is None:
+            agents = tuple(sorted(agents, key=_by_name))
         for agent in agents:
             space = env.observation_spaces[agent]
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
@@ -156,10 +195,10 @@ class Team:
                     f"The actions of agents {agents[0]!r} and {agent!r} must both be Box or both Discrete, but are "
                     f"{actions[0]} and {space}."
                 )
-            if isinstance(space, gym.spaces.Box) and not space.is_bounded("both"):
+            if isinstance(space, gym.spaces.Box) and not _can_be_scaled_to(space):
                 raise ValueError(
-                    f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs "
-                    f"finite bounds to scale to."
+                    f"The action space of agent {agent!r} is unbounded: {space}; the actor's tanh needs finite bounds "
+                    f"to scale to, whose distance is finite in their type (of integers, bounds within 2**53)."
                 )
         observations = tuple(env.observation_spaces[agent] for agent in agents)
         layouts: dict[str, Groups | None] = dict(getattr(env, "observation_layouts", None) or {})
@@ -179,6 +218,22 @@ class Team:
         )
 
 
+def _by_name(agent: str) -> tuple[list[str | int], str]:
+    """What names are sorted by: numbers in them count as numbers."""
+    parts = re.split(r"(\d+)", str(agent))
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], str(agent)
+
+
+def _can_be_scaled_to(space: gym.spaces.Box) -> bool:
+    """Whether there are bounds, between which arithmetic does not overflow."""
+    if not space.is_bounded("both"):
+        return False
+    if np.issubdtype(space.dtype, np.integer):
+        return bool((space.low >= -(2.0**53)).all() and (space.high <= 2.0**53).all())
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(space.high - space.low).all())
+
+
 def _state_layout(env: JointEnv, given: Groups | None) -> Layout:
     """Resets the environment, and returns what its own state is made of: as given, or else as it says."""
     env.reset()
@@ -188,6 +243,11 @@ def _state_layout(env: JointEnv, given: Groups | None) -> Layout:
 
 def _layout(groups: Groups | None, what: str, size: int, owner: str = "") -> Layout:
     return flat(size, what) if groups is None else as_layout(groups, size, f"{what}{owner}")
+
+
+def finished(terminated: Bool, truncated: Bool) -> Bool:
+    """Which episodes are over, `(...)`: terminated for all agents `(..., N)`, or truncated `(...)` for some."""
+    return truncated | (terminated if terminated.ndim == truncated.ndim else terminated.all(-1))
 
 
 def shares_reward(env: JointEnv, steps: int = 25) -> bool:
@@ -205,7 +265,7 @@ def shares_reward(env: JointEnv, steps: int = 25) -> bool:
     spaces = [env.action_spaces[agent] for agent in env.agents]
     size = max(flatdim(space) for space in spaces)
     for _ in range(steps):
-        actions = np.zeros((env.num_envs, len(spaces), size), dtype=np.float32)
+        actions = np.zeros((env.num_envs, len(spaces), size))
         for agent, space in enumerate(spaces):
             if isinstance(space, gym.spaces.Discrete):
                 actions[:, agent, 0] = rng.integers(space.n, size=env.num_envs)
@@ -216,6 +276,6 @@ def shares_reward(env: JointEnv, steps: int = 25) -> bool:
         _, rewards, terminated, truncated, _ = env.step(actions[..., 0].astype(np.int64) if discrete else actions)
         if np.ptp(rewards, axis=1).max() > REWARD_TOLERANCE * max(1.0, float(np.abs(rewards).max())):
             return False
-        if (terminated | truncated).any():
-            env.reset(mask=terminated | truncated)
+        if (over := finished(terminated, truncated)).any():
+            env.reset(mask=over)
     return True

@@ -72,8 +72,9 @@ class Tunnel(Coverage[TunnelOptions]):
         start_distance: Distance of the agents' start from the gap, along x. [our choice: 1]
         target_distance: Distance of the targets from the gap, along x. [our choice: 1]
         spacing: Distance of neighbours at the start, and of neighbouring targets. [our choice: 0.3]
-        start_noise: Agents start uniformly within this distance of their place, along x and along y. [our choice:
-            0, as in the paper; with it, a policy must do more than replay one episode]
+        start_noise: Agents start uniformly within this distance of their place, along x and along y; those that would
+            overlap are drawn again. [our choice: 0, as in the paper; with it, a policy must do more than replay one
+            episode, and with much of it starts are explored on either side of the gap]
         horizon: Steps per episode. [paper: 100]
         action_mode: "mpe", "force" or "discrete", see `ScenarioOptions`. [MPE: mpe]
         physics: "mpe" or "solid". [MPE: mpe]

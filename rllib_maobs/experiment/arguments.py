@@ -26,6 +26,7 @@ SETTINGS = (
     "checkpoint_freq",
     "no_compile",
     "quick",
+    "start_from",
 )
 
 
@@ -54,6 +55,10 @@ def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
         return int(value)
 
     return parse_number
+
+
+def _absolute(path: str) -> str:
+    return str(Path(path).expanduser().resolve())
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -106,6 +111,14 @@ def make_parser(
         default="observations",
         help="the state that centralised critics see: all observations side by side, or the positions and velocities; "
         "rows with a critic_state of their own keep it",
+    )
+    what.add_argument(
+        "--from",
+        dest="start_from",
+        metavar="CHECKPOINT",
+        type=_absolute,
+        help="start from the networks of another run, such as a trial's folder of a smaller team; all rows must have "
+        "networks of the same kind",
     )
     what.add_argument("--quick", action="store_true", help=f"a small job of about five minutes: {quick}")
 
@@ -202,7 +215,7 @@ def _with_stored_settings(
     args = parser.parse_args(argv)
     for name, value in stored.items():
         if getattr(args, name) != value:
-            flag = f"--{name.replace('_', '-')}"
+            flag = "--from" if name == "start_from" else f"--{name.replace('_', '-')}"
             stands = "what each row has for itself" if value is None else value
             parser.error(
                 f"{flag}: the original run has {stands}, and --resume continues it as it is: leave {flag} out, or "

@@ -3,10 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rllib_maobs.envs import SCENARIOS, VectorEnv, make_vec
+from rllib_maobs.envs import SCENARIOS, make_vec
+from rllib_maobs.policies import make_policy, play_episodes
 
 
 def play_baselines(env: str, env_config: Mapping[str, Any], episodes: int = 100) -> dict[str, dict[str, float]]:
@@ -27,29 +25,8 @@ def play_baselines(env: str, env_config: Mapping[str, Any], episodes: int = 100)
     baselines = {}
     for policy in ("random", "heuristic"):
         try:
-            baselines[policy] = _play(vec, policy)
+            rows = play_episodes(vec, make_policy(vec, policy))
         except NotImplementedError:
             continue
+        baselines[policy] = rows.drop(columns=["seed", "return"]).mean().to_dict()
     return baselines
-
-
-def _play(env: VectorEnv, policy: str) -> dict[str, float]:
-    env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    totals: dict[str, float] = {}
-    running = np.ones(env.num_envs, bool)
-    while running.any():
-        _, _, terminated, truncated, info = env.step(_random(env, rng) if policy == "random" else env.heuristic())
-        finished = terminated | truncated
-        for name, values in info.get("episode_metrics", {}).items():
-            totals[name] = totals.get(name, 0.0) + float(values[finished & running].sum())
-        running &= ~finished
-        if finished.any() and running.any():  # Where episodes may terminate, the others go on.
-            env.reset(mask=finished)
-    return {name: total / env.num_envs for name, total in totals.items()}
-
-
-def _random(env: VectorEnv, rng: np.random.Generator) -> NDArray[Any]:
-    shape = (env.num_envs, len(env.agents))
-    space = env.action_spaces[env.agents[0]]
-    return rng.integers(0, 5, shape) if not space.shape else rng.uniform(-1.0, 1.0, (*shape, *space.shape))

@@ -6,7 +6,8 @@ from pathlib import Path
 from rllib_maobs.envs import SCENARIOS, Recorder, parallel_env
 from rllib_maobs.experiment.report import FILM, LAST, best_trial, embed_film, load_curves
 from rllib_maobs.experiment.trial import TrialSpec
-from rllib_maobs.play import make_policy, play
+from rllib_maobs.play import play
+from rllib_maobs.policies import make_policy
 
 
 def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[str] = (), last: int = LAST) -> str:
@@ -36,7 +37,7 @@ def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[
     try:
         recorder = Recorder(results_dir / FILM)
         env = parallel_env(scenario, render_mode="rgb_array", **spec.evaluation_options)
-        play(env, make_policy(env, str(checkpoint)), recorder=recorder)
+        play(env, make_policy(env.vector, str(checkpoint)), recorder=recorder)
         recorder.close()
     except Exception as error:  # Whatever it is, the results are there, and matter more.
         return f"No film: {str(error).partition(chr(10))[0] or type(error).__name__}"

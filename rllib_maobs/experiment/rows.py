@@ -2,9 +2,11 @@
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import rllib_maobs as maobs
+from rllib_maobs.envs import SCENARIOS, make_scenario
 from rllib_maobs.options import Range, check_value, closest
 
 PAPER_HORIZON = 100
@@ -12,6 +14,7 @@ _Count = Annotated[int, Range(1)]
 # What a row may set beside arguments of training(), and what is legal for it.
 OF_THE_TRIAL: dict[str, Any] = {
     "env_config": None,
+    "train_env_config": None,
     "train_horizon": _Count,
     "num_envs_per_env_runner": _Count,
     "one_policy": bool,
@@ -24,6 +27,7 @@ OF_THE_TRIAL: dict[str, Any] = {
 _OF_RLLIB = ("gamma", "train_batch_size_per_learner", "grad_clip", "grad_clip_by")
 DEFAULTS: dict[str, Any] = {
     "env_config": {},
+    "train_env_config": {},
     "train_horizon": PAPER_HORIZON,
     "num_envs_per_env_runner": 8,
     "one_policy": False,
@@ -58,6 +62,27 @@ def decayed(rate: float) -> Callable[[int], list[list[float]]]:
     return schedule
 
 
+def fading(epsilon: float, noise: float, final: float) -> Callable[[int], dict[str, float]]:
+    """Return exploration for a row's settings that falls evenly over the first 60 % of a trial, to `final`.
+
+        "exploration": fading(epsilon=0.1, noise=0.2, final=0.02)
+
+    Args:
+        epsilon: Share of random actions at the start.
+        noise: Standard deviation of the Gaussian noise at the start.
+        final: Where both stop.
+
+    Returns:
+        A function from a trial's env steps to settings of `EpsilonGaussian`.
+    """
+
+    def settings(env_steps: int) -> dict[str, float]:
+        decay = (max(epsilon, noise) - final) / (0.6 * env_steps)
+        return {"epsilon": epsilon, "noise": noise, "decay": decay, "final": final}
+
+    return settings
+
+
 def check_row(name: str, row: Mapping[str, Any]) -> None:
     """Check the names of a row's settings, and the values of those that are the trial's.
 
@@ -82,8 +107,12 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
 
 def _check(owner: str, given: Mapping[str, Any], training: list[str], more: list[str]) -> None:
     for key, value in given.items():
-        if key in OF_THE_TRIAL:
+        if OF_THE_TRIAL.get(key) is not None:
             check_value(value, OF_THE_TRIAL[key], key, owner)
+        elif key in OF_THE_TRIAL and not isinstance(value, Mapping):
+            raise ValueError(f"{owner}: {key}={value!r} is illegal; legal: a mapping of the environment's options.")
+        elif key in OF_THE_TRIAL:
+            continue
         elif key not in training:
             raise ValueError(
                 f"{owner} has no setting {key!r}{closest(key, [*OF_THE_TRIAL, *more, *training])}; legal are "
@@ -115,3 +144,25 @@ def settings_of_row(row: Mapping[str, Any], stop_timesteps: int, *, quick: bool)
     own = {key: value for key, value in row.items() if key not in ("algorithm", "quick")}
     small = {**QUICK, **row.get("quick", {})} if quick else {}
     return {**DEFAULTS, "stop_timesteps": stop_timesteps, **own, **small}
+
+
+def options_before(env: str, env_config: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an environment's options are where training changes them: those that evaluation goes by.
+
+    Args:
+        env: Registered name of the environment.
+        env_config: Its options.
+        changed: Those that training changes.
+
+    Raises:
+        ValueError: If that is not known (a foreign environment's default), or one is illegal.
+    """
+    scenario = env.removeprefix("maobs/")
+    if scenario in SCENARIOS:
+        make_scenario(scenario, **{**env_config, **changed})
+        env_config = asdict(make_scenario(scenario, **env_config).options)
+    if unknown := [name for name in changed if name not in env_config]:
+        raise ValueError(
+            f"train_env_config changes {', '.join(unknown)} of {env}: give what evaluation shall have, in env_config."
+        )
+    return {name: env_config[name] for name in changed}

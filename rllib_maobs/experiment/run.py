@@ -17,6 +17,9 @@ import ray
 from ray import tune
 
 import rllib_maobs as maobs
+from rllib_maobs.algorithms.checks import check_compiler
+from rllib_maobs.algorithms.settings import without_effect
+from rllib_maobs.checkpoints import saved_networks
 from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.claim import claim
@@ -24,7 +27,7 @@ from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
 from rllib_maobs.experiment.resume import Grid, forget_decisions
-from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, settings_of_row
+from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
 
@@ -65,6 +68,8 @@ class Experiment:
     Beside `"algorithm"`, one of `maobs.ALGORITHMS`, and arguments of its `training()` it may have:
 
     - `env_config`: options of the environment, in training and evaluation, beside the experiment's;
+    - `train_env_config`: options that only training has, such as a higher price of contacts; what is reported is what
+      the evaluation's own reward says;
     - `train_horizon`: steps of a training episode (100); evaluation episodes always have 100;
     - `num_envs_per_env_runner`: copies of the environment (8);
     - `one_policy`: whether all agents share one policy (False), which needs agents with equal spaces;
@@ -78,10 +83,10 @@ class Experiment:
         name: Names the default results folder.
         env: Registered name of the environment.
         algorithms: Names of the algorithms, or of variants.
-        variants: Algorithms with settings of their own, by the name they shall have in tables. A function among the
-            arguments of `training()` is called with the trial's env steps, as `decayed` does it for learning rates.
+        variants: Algorithms with settings of their own, by the name they shall have in tables.
         quick_algorithms: Those of `algorithms` that `--quick` trains; none for all.
-        training: Arguments of the configs' `training()`, the same for all algorithms.
+        training: Arguments of the configs' `training()`, the same for all algorithms. A function among them, or among
+            those of a variant, is called with the trial's env steps, see `decayed` and `fading`.
         env_config: Options of the environment.
         stop_timesteps: Env steps of a trial.
     """
@@ -115,10 +120,15 @@ class Experiment:
         parser = make_parser(self.name, self.algorithms, self.stop_timesteps, doc, self.quick_algorithms)
         args = parse(parser, self.name, argv, self.quick_algorithms)
         _quiet()
-        specs = self.specs(args)
         try:
+            specs = self.specs(args)
+            if any(spec.torch_compile for spec in specs) and not args.address:
+                check_compiler()
             for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
-                spec.build_config().validate()
+                config = spec.build_config()
+                config.validate()
+                if spec.start_from and not args.resume:
+                    saved_networks(config, spec.start_from)
         except ValueError as error:
             parser.error(str(error))
         try:
@@ -143,29 +153,41 @@ class Experiment:
         row = self.variants.get(algorithm, {})
         own = settings_of_row(row, self.stop_timesteps, quick=args.quick)
         steps = args.stop_timesteps or own["stop_timesteps"]
-        training = {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
-        training = {key: value(steps) if callable(value) else value for key, value in training.items()}
+        training = {**self.training, "critic_state": args.critic_state}
+        training |= {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
+        # A class is a setting, too: of a network, say.
+        depends = {key for key, value in training.items() if callable(value) and not isinstance(value, type)}
+        training = {key: value(steps) if key in depends else value for key, value in training.items()}
         horizon = args.train_horizon or own["train_horizon"]
+        # What all rows share need not mean something to each, such as critic_state to IDDPG.
+        config = maobs.ALGORITHMS[row.get("algorithm", algorithm)]().training(**training)
+        unheard = {*without_effect(config)} - {*row}
+        training = {key: value for key, value in training.items() if key not in unheard}
+        env_config = {**self.env_config, **own["env_config"]}
         return TrialSpec(
             algorithm=algorithm,
             variant_of=row.get("algorithm", ""),
             seed=seed,
             env=self.env,
             stop_timesteps=steps,
-            training={**self.training, "critic_state": args.critic_state, **training},
-            env_config={**self.env_config, **own["env_config"], "horizon": horizon},
-            evaluation_env_config={"horizon": PAPER_HORIZON},
+            training=training,
+            env_config={**env_config, **own["train_env_config"], "horizon": horizon},
+            evaluation_env_config={
+                **options_before(self.env, env_config, own["train_env_config"]),
+                "horizon": PAPER_HORIZON,
+            },
             num_env_runners=args.num_env_runners,
             num_envs_per_env_runner=own["num_envs_per_env_runner"],
             one_policy=own["one_policy"],
             torch_compile=own["torch_compile"] and not args.no_compile,
             steps_per_iteration=own["steps_per_iteration"],
             evaluation_duration=own["evaluation_duration"],
+            start_from=args.start_from or "",
         )
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
         """Measure, train, report; return the exit code."""
-        _start_ray(args)
+        started = _start_ray(args)
         try:
             maobs.register()
             args.results_dir.mkdir(parents=True, exist_ok=True)
@@ -178,7 +200,8 @@ class Experiment:
                 tuner = _make_tuner(self.name, args, specs)
             trials = tuner.fit()
         finally:
-            ray.shutdown()
+            if started:
+                ray.shutdown()
         return self._report(args, trials, specs)
 
     def _print_plan(self, args: Namespace, specs: list[TrialSpec]) -> None:
@@ -274,14 +297,20 @@ def _quiet() -> None:
     os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
 
 
-def _start_ray(args: Namespace) -> None:
-    """Start Ray on this machine with one CPU per process of a trial, or connect to a cluster."""
+def _start_ray(args: Namespace) -> bool:
+    """Start Ray on this machine with one CPU per process of a trial, or connect to a cluster.
+
+    Returns:
+        Whether it was for this to do: a program that has started Ray already goes on with it.
+    """
+    if ray.is_initialized():
+        return False
     if args.address:
         try:
             ray.init(address=args.address, log_to_driver=False, logging_level=logging.ERROR)
         except ConnectionError as error:
             sys.exit(f"error: --address {args.address}: {error}")
-        return
+        return True
     if args.dashboard and find_spec("aiohttp") is None:
         sys.exit('error: --dashboard needs Ray\'s dashboard: pip install -c constraints.txt "ray[default]"')
     ray.init(
@@ -291,6 +320,7 @@ def _start_ray(args: Namespace) -> None:
         log_to_driver=False,
         logging_level=logging.ERROR,
     )
+    return True
 
 
 def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:

@@ -51,6 +51,7 @@ class TrialSpec:
         steps_per_iteration: Env steps between evaluations.
         evaluation_duration: Episodes per evaluation.
         variant_of: The algorithm, if `algorithm` names a variant of it.
+        start_from: Checkpoint whose networks it starts from; "" for new ones.
     """
 
     algorithm: str
@@ -67,6 +68,7 @@ class TrialSpec:
     steps_per_iteration: int = 1000
     evaluation_duration: int = 10
     variant_of: str = ""
+    start_from: str = ""
 
     @property
     def name(self) -> str:
@@ -130,11 +132,14 @@ class Trial(tune.Trainable):
     def setup(self, config: dict[str, Any]) -> None:
         """Build the algorithm."""
         spec = TrialSpec(**config)
-        self._stop_timesteps = spec.stop_timesteps
+        self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
         self._algorithm = _build(spec.build_config())
 
     def step(self) -> dict[str, Any]:
         """Train for one iteration; the result says whether that was the last one."""
+        if self._start_from:
+            maobs.load_networks(self._algorithm, self._start_from)
+            self._start_from = ""
         result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
         return {**result, "done": result[STEPS] >= self._stop_timesteps}
 
@@ -143,7 +148,8 @@ class Trial(tune.Trainable):
         self._algorithm.save_checkpoint(checkpoint_dir)
 
     def load_checkpoint(self, checkpoint: Any) -> None:
-        """Restore the algorithm."""
+        """Restore the algorithm; a checkpoint of its own comes before one to start from."""
+        self._start_from = ""
         self._algorithm.load_checkpoint(checkpoint)
 
     def cleanup(self) -> None:

@@ -69,7 +69,7 @@ class JointLearner(TorchLearner):
         self._torch_compile_forward_train = self._torch_compile_complete_update = False
         self._sum: Tensor | None = None
         self._updates = self._actor_updates = 0
-        self._updates_lifetime = 0
+        self._updates_lifetime = self._env_steps = 0
         # What an update may depend on but for numbers in tensors: each combination is compiled on its own.
         self.stage = ""
         self._compiled: dict[tuple[str, bool, int], Callable[..., Any]] = {}
@@ -398,6 +398,7 @@ class JointLearner(TorchLearner):
                 self.metrics.log_value((mid, name), sum(of_agents) / len(of_agents), window=1)
         self.metrics.log_value((ALL_MODULES, NUM_UPDATES_LIFETIME), self._updates, reduce="lifetime_sum")
         self._sum, self._updates, self._actor_updates = None, 0, 0
+        self._env_steps = (timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
 
@@ -417,6 +418,7 @@ class JointLearner(TorchLearner):
         generator = self._generator.get_state().numpy()
         state[_PROGRESS] = {
             "updates": self._updates_lifetime,
+            "env_steps": self._env_steps,
             "generator": generator,
             "layout": _LAYOUT,
             "shapes": self._shapes(),
@@ -442,11 +444,20 @@ class JointLearner(TorchLearner):
                 f"This learner's state is that of other networks, or of agents that share them otherwise: {saved} was "
                 f"saved, here it would be {self._shapes()}."
             )
+        # RLlib's learner skips modules, and runners skip weights, that are not newer than their own; but what is set
+        # here is meant.
+        newest, self._weights_seq_no = self._weights_seq_no, 0  # type: ignore[has-type]
         super().set_state(state)
+        self._weights_seq_no = max(self._weights_seq_no, newest + 1)
         self._adam.bind()  # the optimisers' tensors are new ones
         if _PROGRESS in state:
             self._updates_lifetime = state[_PROGRESS]["updates"]
             self._generator.set_state(torch.from_numpy(state[_PROGRESS]["generator"]))
+        if "env_steps" in state.get(_PROGRESS, {}):  # which earlier revisions did not save
+            self._env_steps = state[_PROGRESS]["env_steps"]
+            # Learning rates are this configuration's, not the saved ones: Tune may have changed them in between.
+            for optimizer, schedule in self._optimizer_lr_schedules.items():
+                self._set_optimizer_lr(optimizer, lr=schedule.update(timestep=self._env_steps))
 
     @override(TorchLearner)
     def _log_trainable_parameters(self) -> None:

@@ -74,16 +74,21 @@ def network_settings(
     Raises:
         ValueError: For one that it does not take; names the legal ones.
     """
-    takes = settings_of(cls, reserved)
-    anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values())
     common = {
         own: model_config[name]
         for name, own in COMMON_SETTINGS.items()
-        if name in model_config and (own in takes or (anything and own == name))
+        if name in model_config and takes(cls, name, reserved)
     }
     settings = copy.deepcopy({**common, **own})  # each network has its own
     check_settings(cls, settings, reserved)
     return settings
+
+
+def takes(cls: type[Any], name: str, reserved: Collection[str] = ()) -> bool:
+    """Whether a network takes a setting of RLlib's `model_config`."""
+    own, parameters = COMMON_SETTINGS[name], settings_of(cls, reserved)
+    anything = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return own in parameters or (anything and own == name)
 
 
 class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
@@ -233,6 +238,27 @@ class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             raise ValueError("An agent with normalize_observations=True has statistics for one observation only.")
         return other
 
+    def exportable(self) -> nn.Module:
+        """This agent without RLlib: an ordinary network for `torch.export`, ONNX or TorchScript.
+
+        ```python
+        torch.jit.trace(module.exportable(), torch.zeros(1, 18)).save("agent_0.pt")
+        ```
+
+        Returns:
+            From observations `(B, O)`, as the environment gives them, to actions `(B, A)` in [-1, 1], or to the numbers
+            of discrete ones `(B,)`. It has copies of the weights, and of the normalisation of observations.
+
+        Raises:
+            ValueError: If the actor is recurrent, so that its actions depend on a state.
+        """
+        if self.recurrent:
+            raise ValueError(
+                "The actor is recurrent: its actions depend on a window of observations. Use forward_inference with "
+                '"state_in", see the class.'
+            )
+        return Exportable(copy.deepcopy(self.normalizer), copy.deepcopy(self.acting), self.discrete).eval()
+
     @cached_property
     def exploration(self) -> Exploration:
         """How it explores; made when it is first needed, so that an agent elsewhere acts without its noise's class."""
@@ -290,6 +316,19 @@ class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
     def _forward_exploration(self, batch: dict[str, Any], t: int = 0, **kwargs: Any) -> dict[str, Any]:
         with torch.no_grad():
             return self._act(batch, self.acting, t)
+
+
+class Exportable(nn.Module):
+    """What an agent makes of an observation: normalisation, actor, and tanh or argmax; see `AgentModule.exportable`."""
+
+    def __init__(self, normalizer: nn.Module, actor: nn.Module, discrete: bool) -> None:
+        super().__init__()
+        self.normalizer, self.actor, self.discrete = normalizer, actor, discrete
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions of observations `(B, O)`."""
+        outputs: Tensor = self.actor(self.normalizer(observation))
+        return outputs.argmax(-1) if self.discrete else torch.tanh(outputs)
 
 
 class UtilityModule(AgentModule):

@@ -80,12 +80,22 @@ class Acting:
             self._recurrent_state = torch.zeros(num_envs, len(modules), *next(iter(shapes.values())))
 
     def _scale(self, team: Team) -> None:
-        """Finds the lower bound, and half the range, of what an action in [-1, 1] stands for, `(N, A)` each."""
-        self._low, self._range = np.zeros((2, *team.action_mask.shape), dtype=np.float32)
-        for row, space in enumerate(team.action_spaces):
-            if isinstance(space, gym.spaces.Box):
-                self._low[row, : space.shape[0]] = space.low
-                self._range[row, : space.shape[0]] = (space.high - space.low) / 2.0
+        """Finds the lower bound, and half the range, of what an action in [-1, 1] stands for, `(N, A)` each.
+
+        Integers get equal shares of [-1, 1]: the range is one wider, and what it is scaled to rounded down.
+        """
+        boxes = [(row, space) for row, space in enumerate(team.action_spaces) if isinstance(space, gym.spaces.Box)]
+        single = all(space.dtype in (np.float16, np.float32) for _, space in boxes)
+        self._low, high = np.zeros((2, *team.action_mask.shape), dtype=np.float32 if single else np.float64)
+        whole = np.zeros(team.action_mask.shape, dtype=np.bool_)
+        for row, space in boxes:
+            own = slice(space.shape[0])
+            self._low[row, own], high[row, own] = space.low, space.high
+            whole[row, own] = np.issubdtype(space.dtype, np.integer)
+        self._range = (high - self._low + whole) / 2.0
+        # Rounding may lead out of the bounds at their upper ends; where it does not, nothing is clipped.
+        exact = single and bool((self._low + 2.0 * self._range <= high).all())
+        self._limits = None if exact else (high, whole)
 
     def share(self, actors: Actors, normalizers: Normalizers | None) -> None:
         """Acts with the tensors of a learner in this process from now on, so weights need no syncing."""
@@ -188,7 +198,13 @@ class Acting:
 
     def to_env(self, actions: NDArray[np.float32]) -> NDArray[Any]:
         """Actions as the environment takes them: scaled to its bounds `(E, N, A)`, or numbers `(E, N)`."""
-        return actions.argmax(-1) if self._team.discrete else self._low + (actions + 1.0) * self._range
+        if self._team.discrete:
+            return actions.argmax(-1)
+        scaled = self._low + (actions + 1.0) * self._range
+        if self._limits is None:
+            return scaled
+        high, whole = self._limits
+        return np.clip(np.where(whole, np.floor(scaled), scaled), self._low, high)
 
     def get_state(self) -> dict[str, Any]:
         """What acting remembers, and the random numbers to come."""

@@ -29,9 +29,10 @@ from ray.rllib.utils.metrics import (
     SAMPLE_TIMER,
     WEIGHTS_SEQ_NO,
 )
+from ray.util import log_once
 
-from rllib_maobs.envs.joint import snapshot
-from rllib_maobs.envs.team import JointEnv, Team
+from rllib_maobs.envs.snapshot import snapshot
+from rllib_maobs.envs.team import JointEnv, Team, finished
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
 from rllib_maobs.runner.acting import Acting
@@ -40,8 +41,8 @@ from rllib_maobs.runner.episodes import EPISODE_METRICS, Episodes
 from rllib_maobs.runner.errors import EnvError, portable
 from rllib_maobs.runner.making import make_env
 
-COMPONENT_SAMPLING = "sampling"
 logger = logging.getLogger(__name__)
+COMPONENT_SAMPLING = "sampling"
 # Its number, the row of every column, and what there was at the end of the episodes that ended.
 _Step = tuple[int, dict[str, Any], dict[str, Any]]
 
@@ -65,7 +66,7 @@ class JointSample:
 
     def env_steps(self) -> int:
         """L * E."""
-        return self.terminated.size
+        return self.truncated.size
 
     def agent_steps(self) -> int:
         """L * E * N."""
@@ -94,11 +95,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self.module_ids: tuple[str, ...] = self.config.module_ids
         self.env: JointEnv | None = None
         self.num_envs: int = self.config.num_envs_per_env_runner
-        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
-        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
-        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation),))
-        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
-        self._generator = torch.Generator().manual_seed(int(seeds.generate_state(1)[0]))
+        self._generator = torch.Generator()
+        self._seed_anew()
         self._callbacks = Callbacks(self)
         self._obs: NDArray[np.float32] | None = None
         self._needs_reset = True
@@ -115,6 +113,14 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._steps_sampled = 0
         self._source = f"{self.worker_index}-{uuid.uuid4().hex}"
 
+    def _seed_anew(self, *after: int) -> None:
+        """Seeds the copies' next first reset, and exploration; after some steps otherwise than at the start."""
+        # One stream of randomness per runner and purpose, far from each other even for neighbouring seeds.
+        entropy = None if self.config.seed is None else [self.config.seed, self.worker_index or 0]
+        seeds = np.random.SeedSequence(entropy, spawn_key=(int(self.config.in_evaluation), *after))
+        self._env_seeds = [int(s) for s in seeds.spawn(1)[0].generate_state(self.num_envs)]
+        self._generator.manual_seed(int(seeds.generate_state(1)[0]))
+
     @override(EnvRunner)
     def make_env(self) -> None:
         """Makes the E copies anew; they are reset at the next `sample()`."""
@@ -123,7 +129,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                 self.env.close()
             except Exception as error:  # it may be closed because it is broken
                 logger.warning("The environment of runner %s could not be closed: %r", self.worker_index, error)
-        self.env = make_env(self.config, self.num_envs, self.worker_index or 0)
+        self.env = make_env(self.config, self.num_envs, self.worker_index or 0, self.team)
         self._obs, self._needs_reset = None, True
         self._callbacks.on_environment_created()
 
@@ -162,7 +168,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             **kwargs: Ignored.
 
         Returns:
-            One `JointSample` in a list.
+            One `JointSample` in a list; none if none is asked for.
 
         Raises:
             ValueError: If an observation or reward is not finite; names the agent, copy and step.
@@ -173,6 +179,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             raise ValueError(f"{self} has no environment, so it cannot sample.")
         if num_timesteps is not None and num_episodes is not None:
             raise ValueError("Give either num_timesteps or num_episodes, not both.")
+        if num_timesteps == 0 or num_episodes == 0:
+            return []  # an evaluation has less to play than it has runners
         self.error = None
         explore = self.config.explore if explore is None else explore
         with self.metrics.log_time(SAMPLE_TIMER):
@@ -231,7 +239,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         while (left > 0).any():
             if self._advance(parts, explore, random_actions, counted=left > 0):
                 _, row, _ = parts[-1][-1]
-                ended = row["terminated"] | row["truncated"]
+                ended = finished(row["terminated"], row["truncated"])
                 if (ended & (left > 0)).any():
                     self._failures = 0
                 left -= ended
@@ -296,15 +304,18 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             row["actions"] = self.acting(self._obs, t, explore=explore, random=random_actions)
         played = self.acting.to_env(row["actions"])
         try:
-            self._obs, row["rewards"], row["terminated"], row["truncated"], info = self.env.step(played)
+            self._obs, row["rewards"], terminated, row["truncated"], info = self.env.step(played)
         except Exception as error:
             raise EnvError from error
+        done = finished(terminated, row["truncated"])
+        row["terminated"] = (
+            terminated if terminated.ndim == 2 else terminated[:, None].repeat(row["rewards"].shape[1], 1)
+        )
         self._episodes.add(row["rewards"])
         self._check_finite("observation", self._obs)
         self._check_finite("reward", row["rewards"])
         self._steps_sampled += 1
         self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
-        done = row["terminated"] | row["truncated"]
         if self._watcher is not None:
             self._watcher.step(row, self._obs, done, info, counted)
         if not done.any():
@@ -346,7 +357,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         copy, agent = np.argwhere(~np.isfinite(values))[0][:2]
         raise ValueError(
             f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._episodes.lengths[copy]} "
-            f"of its episode in environment copy {copy} (runner {self.worker_index}): {values[copy, agent]}."
+            f"of its episode in environment copy {copy} of {self.config.env} (runner {self.worker_index}): "
+            f"{values[copy, agent]}; legal: finite numbers."
         )
 
     @override(EnvRunner)
@@ -410,7 +422,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         not_components: str | Collection[str] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Weights, step count, and where the copies are in their episodes (if the environment can be pickled)."""
+        """Weights, step count, and where the copies are in their episodes (see `snapshot`)."""
         state: dict[str, Any] = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self.num_env_steps_sampled_lifetime}
         if self.module is not None and self._check_component(COMPONENT_RL_MODULE, components, not_components):
             state[COMPONENT_RL_MODULE] = self.module.get_state(
@@ -432,7 +444,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
     @override(Checkpointable)
     def set_state(self, state: dict[str, Any]) -> None:
-        """Goes on from a saved state; an environment that could not be saved starts new episodes."""
+        """Goes on from a saved state; an environment that would not go on exactly starts new episodes."""
         if COMPONENT_RL_MODULE in state and self.module is not None:
             seq_no = state.get(WEIGHTS_SEQ_NO, 0)
             if seq_no == 0 or self._weights_seq_no < seq_no:
@@ -447,7 +459,14 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         if sampling is None or self.env is None or sampling["in_evaluation"] != self.config.in_evaluation:
             return
         if sampling["env"] is None or sampling["num_envs"] != self.num_envs:
-            self._needs_reset = True
+            if log_once(f"new episodes of {self.config.env}"):
+                logger.warning(
+                    f"Environment {self.config.env} starts new episodes: it cannot be continued exactly where it was "
+                    f"saved (its copies do not come back from pickle as they were, or are others in number)."
+                )
+            # Not those that the run began with: episodes and noise would repeat themselves.
+            self._seed_anew(sampling["_steps_sampled"])
+            self._obs, self._needs_reset = None, True
             return
         self.env = pickle.loads(sampling["env"])
         self.acting.set_state(sampling["acting"])

@@ -8,8 +8,8 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.env.env_context import EnvContext
 from ray.tune.registry import ENV_CREATOR, _global_registry
 
-from rllib_maobs.envs.joint import WithAgentIds, make_joint_env, register_envs
-from rllib_maobs.envs.team import JointEnv
+from rllib_maobs.envs.joint import InOrder, WithAgentIds, make_joint_env, register_envs
+from rllib_maobs.envs.team import JointEnv, Team
 
 
 def env_creator(config: AlgorithmConfig) -> Any:
@@ -29,8 +29,24 @@ def env_creator(config: AlgorithmConfig) -> Any:
     )
 
 
-def make_env(config: AlgorithmConfig, num_envs: int, worker_index: int = 0) -> JointEnv:
-    """E copies of a config's environment, see `make_joint_env`."""
+def make_env(config: AlgorithmConfig, num_envs: int, worker_index: int = 0, team: Team | None = None) -> JointEnv:
+    """E copies of a config's environment, see `make_joint_env`.
+
+    Args:
+        config: The config.
+        num_envs: E.
+        worker_index: Number of the runner that steps them.
+        team: The team whose order all arrays are to have; None for the environment's own.
+
+    Raises:
+        ValueError: If the environment's agents, or their spaces, are not the team's.
+    """
     context = EnvContext(config.env_config or {}, worker_index=worker_index, num_workers=config.num_env_runners)
     env = make_joint_env(env_creator(config), context, num_envs)
-    return WithAgentIds(env) if config.agent_id_input else env
+    if team is not None and env.agents != [*team.agents] and set(env.agents) == set(team.agents):
+        env = InOrder(env, team.agents)
+    env = WithAgentIds(env) if config.agent_id_input else env
+    if team is not None:
+        role = "evaluation runner" if config.in_evaluation else "runner"
+        team.check(env, f"environment {config.env!r} ({role} {worker_index})")
+    return env

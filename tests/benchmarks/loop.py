@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 Sample = dict[str, Tensor]
-"""obs, next_obs (B, N, O); state, next_state (B, S); actions (B, N, A); rewards (B, N); terminated (B, 1)."""
+"""obs, next_obs (B, N, O); state, next_state (B, S); actions (B, N, A); rewards (B, N); terminated (B, N)."""
 
 
 def network(inputs: int, outputs: int, hidden: tuple[int, ...], last: nn.Module) -> nn.Sequential:
@@ -62,7 +62,7 @@ class LoopLearner:
     def critic_loss(self, a: int, s: Sample, next_actions: list[Tensor]) -> Tensor:
         with torch.no_grad():
             next_q = self.target_critics[a](self.critic_input(a, s["next_obs"], s["next_state"], next_actions))
-            y = s["rewards"][:, a : a + 1] + self.gamma * (1 - s["terminated"]) * next_q
+            y = s["rewards"][:, a : a + 1] + self.gamma * (1 - s["terminated"][:, a : a + 1]) * next_q
         actions = [s["actions"][:, b] for b in self.agents]
         return ((y - self.critics[a](self.critic_input(a, s["obs"], s["state"], actions))) ** 2).mean()
 

@@ -1,0 +1,340 @@
+"""Every setting of RLlib does what it says or is refused, and so is what nobody knows or what would do nothing."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core.rl_module import MultiRLModuleSpec, RLModuleSpec
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_TRAINED_LIFETIME
+
+import rllib_maobs as maobs
+from rllib_maobs.algorithms import settings
+from tests.conftest import ALGORITHMS, build_learner, small_config
+from tests.test_runner import TwoAgents, runner_of, sample
+
+PAGE = Path(__file__).parent.parent / "docs" / "rllib_settings.md"
+EVERY = [(method, name) for method in settings.METHODS for name in settings.settings_of_method(method)]
+DECIDED = (settings.HONOURED, settings.HARMLESS, settings.REFUSED)
+
+# The table.
+
+
+def test_rllib_has_no_method_and_no_setting_that_is_not_decided() -> None:
+    fluent = {
+        name
+        for name, method in vars(AlgorithmConfig).items()
+        if callable(method) and name[0] != "_" and "Self" in str(getattr(method, "__annotations__", {}).get("return"))
+    }
+    fluent -= {"copy", "from_dict", "from_state", "update_from_dict", "get_config_for_module"}
+    assert fluent == set(settings.METHODS)
+    assert not [name for _, name in EVERY if sum(name in table for table in DECIDED) != 1]
+
+
+def test_nothing_is_decided_that_rllib_does_not_have() -> None:
+    names, attributes = {name for _, name in EVERY}, vars(AlgorithmConfig())
+    assert set().union(*DECIDED) == names
+    assert not [name for name in names if settings.attribute_of(name) not in attributes]
+
+
+def test_the_page_is_the_table() -> None:
+    assert PAGE.read_text().endswith(settings.settings_table())
+
+
+def test_what_is_refused_is_refused_away_from_its_default() -> None:
+    for name in settings.REFUSED:
+        config = maobs.MADDPGConfig().environment("maobs/spread-3a")
+        setattr(config, settings.attribute_of(name), ["another"])
+        with pytest.raises(ValueError, match=rf"^{name} must be .*, not \['another'\]: \w.*\.$"):
+            config.validate()
+
+
+def test_what_has_no_meaning_may_be_given() -> None:
+    config = maobs.MADDPGConfig().environment("maobs/spread-3a")
+    for name in settings.HARMLESS:
+        value = getattr(config, settings.attribute_of(name))
+        setattr(config, settings.attribute_of(name), not value if isinstance(value, bool) else value)
+    config.env_runners(episodes_to_numpy=False, episode_lookback_horizon=7, merge_env_runner_states=False)
+    config.validate()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_defaults_are_never_refused(algorithm: str) -> None:
+    config = maobs.ALGORITHMS[algorithm]()
+    config.environment("maobs/spread-3a", env_config={"action_mode": "discrete"})
+    config.validate()
+    config.copy(copy_frozen=False).validate()
+    evaluation = config.get_evaluation_config_object()
+    evaluation.validate()
+    assert evaluation.batch_mode != config.batch_mode  # which is RLlib's doing, and no error
+
+
+# Wrong settings, in one sentence each.
+
+
+class Foreign(TorchRLModule):
+    """An RLModule that knows nothing of this package."""
+
+
+def named(*agents: str) -> Any:
+    class Named(TwoAgents):
+        def __init__(self, config: dict[str, Any]) -> None:
+            super().__init__(config)
+            for spaces in (self.observation_spaces, self.action_spaces):
+                spaces |= dict(zip(agents, list(spaces.values()), strict=True))
+            self.agents = self.possible_agents = list(agents)
+
+    return Named
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "change", "message"),
+    [
+        ("maddpg", lambda c: c.training(lr=0.5), r"^lr must be 0.001, not 0.5: use actor_lr and critic_lr\.$"),
+        ("maddpg", lambda c: c.training(num_epochs=7), r"^num_epochs must be 1, not 7: use training\(updates_per_env"),
+        ("maddpg", lambda c: c.environment(clip_rewards=True), r"^clip_rewards must be None, not True: use training"),
+        ("maddpg", lambda c: c.evaluation(evaluation_config={"lr": 0.5}), r"^lr must be 0.001, not 0.5"),
+        # What nobody knows.
+        ("maddpg", lambda c: c.training(actor_lrr=1.0), r"MADDPGConfig has no setting 'actor_lrr' \(.*'actor_lr'\?\)"),
+        ("maddpg", lambda c: setattr(c, "actor_lrr", 1.0), r"has no setting 'actor_lrr' \(did you mean 'actor_lr'"),
+        ("maddpg", lambda c: c.update_from_dict({"taau": 1.0}), r"has no setting 'taau' \(did you mean 'tau'"),
+        ("maddpg", lambda c: c.evaluation(evaluation_config={"exploer": False}), r"no setting 'exploer' .*'explore'"),
+        ("maddpg", lambda c: c.training(double_q=True), r"has no setting 'double_q'; it is one of iql, vdn, qmix\.$"),
+        ("qmix", lambda c: c.training(critic_source="own"), r"QMIXConfig has no setting 'critic_source'; .* facmac\.$"),
+        # What does nothing with this algorithm, or without another setting.
+        ("iddpg", lambda c: c.training(critic_state="world"), r"^critic_state must be 'observations', .* of iddpg see"),
+        ("vdn", lambda c: c.training(critic_state="world"), r"^critic_state must be 'observations', .* of vdn see"),
+        ("maddpg", lambda c: c.training(seq_length=3), r"^seq_length must be 5, not 3: .* needs a recurrent actor"),
+        (
+            "iql",
+            lambda c: c.training(actor_lr=0.5),
+            r"^actor_lr must be 0.001, not 0.5: iql has no actors: .*critic_lr",
+        ),
+        (
+            "qmix",
+            lambda c: c.training(gumbel_temperature=0.5),
+            r"^gumbel_temperature must be 1.0, .* qmix has no actors",
+        ),
+        ("maddpg", lambda c: c.training(gumbel_temperature=0.5), r"^gumbel_temperature must be 1.0, .* are continuous"),
+        ("maddpg", lambda c: c.training(target_noise_clip=0.1), r"^target_noise_clip must be 0.5, .* target_noise > 0"),
+        (
+            "maddpg",
+            lambda c: c.training(grad_clip_by="value"),
+            r"^grad_clip_by must be 'global_norm', .* needs grad_clip",
+        ),
+        (
+            "maddpg",
+            lambda c: c.training(state_layout=[("a", 1, 22)]),
+            r'^state_layout must .* needs critic_state="world"',
+        ),
+        # Networks.
+        (
+            "maddpg",
+            lambda c: c.rl_module(model_config={"lstm_cell_size": 8}),
+            r"'lstm_cell_size'\] has no effect: MLPAct",
+        ),
+        (
+            "maddpg",
+            lambda c: c.rl_module(model_config={"hidden_sizes": 8}),
+            r"hidden_sizes'\] must be positive integers",
+        ),
+        (
+            "maddpg",
+            lambda c: c.rl_module(model_config=DefaultModelConfig()),
+            r"^model_config must be a dict with some of",
+        ),
+        (
+            "maddpg",
+            lambda c: c.rl_module(rl_module_spec=RLModuleSpec(model_config={"fcnet_hiddens": [8]})),
+            r"^The RLModuleSpec sets 'fcnet_hiddens'.*; legal are hidden_sizes",
+        ),
+        (
+            "maddpg",
+            lambda c: c.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs={"agent_0": RLModuleSpec(Foreign)})),
+            r"^The RLModuleSpec of policy 'agent_0' has module_class Foreign, which lacks .*acting, .*make_target_net",
+        ),
+        (
+            "maddpg",
+            lambda c: c.learners(learner_class=object),
+            r"^learner_class must be a JointLearner, not <class 'obj",
+        ),
+        # Agents' names.
+        ("maddpg", lambda c: c.environment(named("mixer", "b"), env_config={}), r"^No policy can be called 'mixer'"),
+        ("maddpg", lambda c: c.environment(named("__all_modules__", "b"), env_config={}), r"can be called '__all_mod"),
+        ("maddpg", lambda c: c.environment(named("a/b", "b"), env_config={}), r"PolicyID `a/b` not valid"),
+    ],
+)
+def test_wrong_settings_end_in_a_sentence(ray_session: None, algorithm: str, change: Any, message: str) -> None:
+    config = small_config(algorithm)
+    with pytest.raises(ValueError, match=message):
+        change(config)
+        config.build_algo()
+
+
+def test_unknown_names_in_a_param_space_are_refused(ray_session: None) -> None:
+    with pytest.raises(ValueError, match=r"has no setting 'actor_lrr' \(did you mean 'actor_lr'\?\)"):
+        maobs.ALGORITHMS["maddpg"]().algo_class(config={"env": "maobs/spread-3a", "actor_lrr": 1e-3})
+
+
+def test_what_a_machine_lacks_is_named(ray_session: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match=r"num_gpus_per_learner must be 0 where PyTorch finds no GPU, not 1"):
+            small_config("maddpg").learners(num_gpus_per_learner=1).build_algo()
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    message = r"no 'no-such-compiler' on the PATH: .*apt install g\+\+.*torch_compile_learner=False.*--no-compile"
+    with pytest.raises(ValueError, match=message):
+        small_config("maddpg").framework(torch_compile_learner=True).build_algo()
+
+
+def test_a_number_is_a_number(ray_session: None) -> None:
+    config = small_config("maddpg", horizon=np.int64(5))
+    config.training(
+        actor_lr=np.float32(1e-3),
+        gamma=np.float64(0.9),
+        grad_clip=np.float32(1.0),
+        train_batch_size_per_learner=np.int64(8),
+        twin_critics=np.bool_(True),
+    )
+    config.env_runners(num_env_runners=np.int64(0), num_envs_per_env_runner=np.int32(2))
+    config.env_runners(rollout_fragment_length=np.int64(2)).debugging(seed=np.int64(3))
+    config.rl_module(model_config={"hidden_sizes": (np.int64(8),)})
+    config.evaluation(evaluation_interval=np.int64(1), evaluation_duration=np.int64(2))
+    algo = config.build_algo()
+    assert algo.train()["evaluation"]["env_runners"]["num_episodes"] == 2
+    assert algo.config.twin_critics is True and type(algo.config.num_envs_per_env_runner) is int
+    algo.stop()
+
+
+# What is honoured has its effect.
+
+
+def test_evaluation_is_as_long_as_it_is_asked_to_be(ray_session: None) -> None:
+    config = small_config("iddpg", horizon=10).evaluation(
+        evaluation_interval=1, evaluation_duration=30, evaluation_duration_unit="timesteps"
+    )
+    algo = config.build_algo()
+    assert algo.train()["evaluation"]["env_runners"]["num_env_steps_sampled"] == 30
+    algo.stop()
+
+
+def test_evaluation_beside_training_by_more_runners_than_episodes(ray_session: None) -> None:
+    config = small_config("facmac", horizon=10).resources(num_cpus_for_main_process=0)
+    config.evaluation(evaluation_interval=1, evaluation_duration=1, evaluation_num_env_runners=2)
+    algo = config.evaluation(evaluation_parallel_to_training=True).build_algo()
+    start = time.monotonic()
+    result = algo.train()
+    assert result["evaluation"]["env_runners"]["num_episodes"] == 1
+    assert algo.eval_env_runner_group.num_healthy_remote_workers() == 2
+    assert time.monotonic() - start < 30  # which the loss of a runner would take
+    # Weights that are set reach all of them, even while others are on their way.
+    weights, state = algo.get_weights(), algo.get_state()
+    want = algo._learner.acting.flat.detach().clone()
+    for restore in (lambda: algo.set_weights(weights), lambda: algo.set_state(state)):
+        algo.train()
+        algo.evaluate()
+        restore()
+        acting = algo.eval_env_runner_group.foreach_env_runner(
+            lambda runner: runner.acting.actors.flat.detach().clone(), local_env_runner=False
+        )
+        assert len(acting) == 2 and all(torch.equal(weights_of_one, want) for weights_of_one in acting)
+    algo.stop()
+
+
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_means_are_over_as_many_episodes_as_are_asked_for(ray_session: None, episodes: int) -> None:
+    config = small_config("iddpg", horizon=5).env_runners(num_envs_per_env_runner=1)
+    runner = runner_of(config.reporting(metrics_num_episodes_for_smoothing=episodes))
+    rewards = sample(runner, num_timesteps=20).rewards.reshape(4, -1)
+    results = runner.get_metrics()
+    assert results["episode_return_mean"].peek() == pytest.approx(rewards[-episodes:].sum(1).mean())
+
+
+def test_reporting_and_callbacks_are_honoured(ray_session: None) -> None:
+    calls: list[str] = []
+    config = small_config("iddpg", horizon=10).rl_module(model_config={"hidden_sizes": (8,)})
+    config.reporting(min_train_timesteps_per_iteration=800)
+    config.callbacks(
+        on_algorithm_init=lambda **kwargs: calls.append("init"),
+        on_train_result=lambda **kwargs: calls.append("result"),
+        on_evaluate_start=lambda **kwargs: calls.append("start"),
+        on_evaluate_end=lambda **kwargs: calls.append("end"),
+    )
+
+    def evaluate(algo: Any, runners: Any) -> tuple[dict[str, Any], int, int]:
+        runners.local_env_runner.sample(num_episodes=3)
+        metrics = runners.local_env_runner.get_metrics()
+        algo.metrics.aggregate([metrics], key=("evaluation", "env_runners"))
+        return {"episodes": 3}, 30, 90
+
+    config.evaluation(evaluation_interval=1, custom_evaluation_function=evaluate)
+    algo = config.build_algo()
+    result = algo.train()
+    assert result["learners"]["__all_modules__"][NUM_ENV_STEPS_TRAINED_LIFETIME] >= 800
+    assert result["evaluation"]["env_runners"]["num_episodes"] == 3
+    assert calls == ["init", "start", "end", "result"]
+    algo.stop()
+
+
+# Restoring, and RLlib's own methods.
+
+
+def test_a_restored_run_has_the_learning_rates_of_its_configuration(ray_session: None, tmp_path: Path) -> None:
+    """What Tune's population-based training does: a checkpoint goes on under another configuration."""
+    schedule = [[0, 1e-3], [1000, 1e-5]]
+    algo = small_config("maddpg").training(critic_lr=schedule).build_algo()
+    algo.train()
+    path = algo.save_to_path(tmp_path / "checkpoint")
+    other = small_config("maddpg").training(critic_lr=schedule, actor_lr=1e-9).build_algo()
+    other.restore_from_path(path)
+    before = [algo._learner._roles[role].flat.detach().clone() for role in ("actor", "critic")]
+    rates = {name: o.param_groups[0]["lr"] for name, o in other._learner._named_optimizers.items()}
+    assert rates["__all_modules___actor"] == 1e-9
+    assert rates["__all_modules___critic"] == pytest.approx(1e-3 - 40 / 1000 * (1e-3 - 1e-5))
+    other.train()
+    after = [other._learner._roles[role].flat.detach() for role in ("actor", "critic")]
+    assert (after[0] - before[0]).abs().max() < 1e-6 < 1e-4 < (after[1] - before[1]).abs().max()
+    algo.stop()
+    other.stop()
+
+
+def test_weights_that_are_set_are_acted_with(ray_session: None) -> None:
+    algo = small_config("facmac").build_algo()
+    algo.train()
+    weights, state = algo.get_weights(), algo.get_state()
+    want = algo._learner.acting.flat.detach().clone()
+    for restore in (lambda: algo.set_weights(weights), lambda: algo.set_state(state)):
+        algo.train()
+        assert not torch.equal(algo._learner.acting.flat, want)
+        restore()
+        assert torch.equal(algo._learner.acting.flat, want)
+        assert algo.env_runner.acting.actors.flat.data_ptr() == algo._learner.acting.flat.data_ptr()
+    algo.stop()
+
+
+def test_methods_of_the_old_stack_show_the_way(ray_session: None) -> None:
+    algo = small_config("iddpg").build_algo()
+    for method in ("get_policy", "compute_single_action", "compute_actions", "add_policy", "remove_policy"):
+        with pytest.raises(NotImplementedError, match=r"algo.get_module\('agent_0'\), and act with module.forward_inf"):
+            getattr(algo, method)(np.zeros(18))
+    with pytest.raises(NotImplementedError, match="team's modules are fixed"):
+        algo.add_module("agent_9", RLModuleSpec())
+    with pytest.raises(ValueError, match=r"evaluate\(\) needs runners of its own: config.evaluation\("):
+        algo.evaluate()
+    algo.stop()
+
+
+def test_policies_differ_in_exploration_and_nothing_else(ray_session: None) -> None:
+    config = small_config("maddpg")
+    config.rl_module(algorithm_config_overrides_per_module={"agent_1": {"actor_lr": 1e-4}})
+    with pytest.raises(
+        ValueError, match=r"\['agent_1'\] sets \['actor_lr'\]; policies may differ in exploration alone"
+    ):
+        config.build_algo()
+    overrides = {"agent_1": maobs.JointConfig.overrides(exploration={"noise": 0.7})}
+    learner = build_learner(small_config("maddpg").rl_module(algorithm_config_overrides_per_module=overrides))
+    assert [learner.module[m].exploration.noise for m in learner.config.module_ids] == [0.1, 0.7, 0.1]
