@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 Infos = Sequence[Mapping[str, Any]]
 _ON_EPISODE = ("on_episode_created", "on_episode_start", "on_episode_step", "on_episode_end")
+_OF_A_RUNNER = ("on_environment_created", *_ON_EPISODE, "on_sample_end")
 
 
 class Callbacks:
@@ -35,19 +36,21 @@ class Callbacks:
     def __init__(self, runner: JointEnvRunner) -> None:
         self._runner = runner
         self._objects = [cls() for cls in force_list(runner.config.callbacks_class)]
+        self._wanted = {name for name in _OF_A_RUNNER if self._overridden(name)}
 
-    def overrides(self, name: str) -> bool:
-        """Whether anybody is to be called."""
+    def _overridden(self, name: str) -> bool:
         nothing = getattr(RLlibCallback, name)
         methods = (getattr(callback, name) for callback in self._objects)
         return bool(self._functions(name)) or any(getattr(m, "__func__", m) is not nothing for m in methods)
 
     def watcher(self) -> EpisodeWatcher | None:
         """What keeps episodes for them, or None if nobody looks at episodes."""
-        return EpisodeWatcher(self, self._runner) if any(map(self.overrides, _ON_EPISODE)) else None
+        return EpisodeWatcher(self, self._runner) if self._wanted.intersection(_ON_EPISODE) else None
 
     def call(self, name: str, **given: Any) -> None:
-        """Calls the classes' methods, then the functions, each in the order of the config."""
+        """Calls the classes' methods, then the functions, each in the order of the config; if there are any."""
+        if name not in self._wanted:
+            return
         given = {"env_runner": self._runner, "metrics_logger": self._runner.metrics, **given}
         make_callback(name, self._objects, self._functions(name), kwargs=given)
 
