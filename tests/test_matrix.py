@@ -196,7 +196,8 @@ def test_rewards_that_differ_later_are_found_when_they_do(ray_session: None) -> 
     config.training(train_batch_size_per_learner=8).env_runners(num_envs_per_env_runner=1)
     algo = config.build_algo()
     with pytest.raises(
-        ValueError, match=r"one team reward, but agents' rewards differ at step 3\d .* copy 0: \[1. 2.\]"
+        ValueError,
+        match=r"one team reward, but agents' rewards differ at step 3\d .* copy 0: {'large': 2.0, 'small': 1.0}",
     ):
         algo.train()
     algo.stop()

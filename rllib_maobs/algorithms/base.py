@@ -142,9 +142,10 @@ class JointAlgorithm(AnyPath, Algorithm):
         spread = np.ptp(sample.rewards, axis=-1)
         if spread.max() > REWARD_TOLERANCE * max(1.0, float(np.abs(sample.rewards).max())):
             step, copy = np.unravel_index(spread.argmax(), spread.shape)
+            rewards = dict(zip(self.config.team.agents, sample.rewards[step, copy].tolist(), strict=True))
             raise ValueError(
                 f"{self.config.name} learns the value of one team reward, but agents' rewards differ at step "
-                f"{sample.start + step} of environment copy {copy}: {sample.rewards[step, copy]}."
+                f"{sample.start + step} of environment copy {copy}: {rewards}."
             )
 
     def _check_runners(self) -> None:
