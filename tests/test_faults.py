@@ -83,6 +83,12 @@ def test_what_goes_wrong_in_remote_runners(ray_session: None, tmp_path: Path) ->
     )
     override = maobs.JointConfig.overrides(env_config={"at": 2, "what": "lidar"}, explore=False)
     config.evaluation(evaluation_num_env_runners=1, evaluation_duration=2, evaluation_config=override)
+    # Callbacks are called in other processes, too.
+    config.callbacks(
+        on_episode_end=lambda *, episode, env_runner, metrics_logger, **given: metrics_logger.log_value(
+            "length", len(episode) * env_runner.worker_index, window=1
+        )
+    )
     algo = config.build_algo()
 
     def change(**settings: Any) -> None:
@@ -102,7 +108,8 @@ def test_what_goes_wrong_in_remote_runners(ray_session: None, tmp_path: Path) ->
             algo.evaluate()
         # The same algorithm goes on, and its runners come back: after an error, and after a crash as a new process.
         change(what="nothing")
-        assert algo.train()["num_env_steps_sampled_lifetime"] >= 40
+        result = algo.train()
+        assert result["num_env_steps_sampled_lifetime"] >= 40 and result["env_runners"]["length"] == 5
         assert algo.env_runner_group.num_healthy_remote_workers() == 1
         change(what="crash")
         algo.train()
