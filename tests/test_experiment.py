@@ -36,6 +36,7 @@ from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.progress import ProgressTable, makespan
 from rllib_maobs.experiment.report import STEPS, best_trial, to_markdown
 from rllib_maobs.experiment.resume import TESTED_RAY, forget_decisions
+from rllib_maobs.experiment.run import _start_ray as start_ray
 from rllib_maobs.experiment.trial import Trial
 
 SCRIPTS = Path(__file__).parent.parent / "tuned_examples"
@@ -374,6 +375,39 @@ def test_settings_that_an_algorithm_refuses_end_before_anything_starts(
     assert end.value.code == 2
     assert "tau=2.0 is illegal; legal: a number > 0 and <= 1" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_what_all_rows_share_is_given_to_those_it_means_something_to() -> None:
+    rows = Experiment(
+        name="demo",
+        env="maobs/spread-3a",
+        algorithms=("iddpg", "maddpg-lstm", "long"),
+        training={"seq_length": 3, "tau": 0.02},
+        variants={"long": {"algorithm": "maddpg", "seq_length": 4}},
+    )
+    iddpg, lstm, long = rows.specs(parsed(rows, "--critic-state", "world"))
+    assert iddpg.training == {"tau": 0.02}
+    assert lstm.training == {"seq_length": 3, "tau": 0.02, "critic_state": "world"}
+    # But what a row itself says is not taken away from it.
+    with pytest.raises(ValueError, match="seq_length must be 5, not 4"):
+        long.build_config().validate()
+
+
+def test_a_missing_compiler_is_named_before_anything_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(SystemExit) as end:
+        EXPERIMENT.main(["--results-dir", str(tmp_path / "new")])
+    assert end.value.code == 2
+    assert "no 'no-such-compiler' on the PATH: install one (apt install g++" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_ray_that_runs_is_joined_and_left_running(ray_session: None) -> None:
+    node = ray.get_runtime_context().get_node_id()
+    assert not start_ray(parsed(EXPERIMENT))
+    assert ray.is_initialized() and ray.get_runtime_context().get_node_id() == node
 
 
 def test_resume_takes_the_settings_of_the_original_run(used: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.env.env_context import EnvContext
 from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 
-from rllib_maobs.envs.joint import StackedEnv, make_joint_env
+from rllib_maobs.envs.joint import StackedEnv, WithAgentIds, make_joint_env
 from rllib_maobs.envs.snapshot import snapshot
 from rllib_maobs.envs.team import Team, finished, shares_reward
 from rllib_maobs.modules.exploration import EpsilonGaussian
@@ -182,6 +182,15 @@ def test_every_copy_has_its_own_config() -> None:
     make_joint_env(creator, context, 3)
     assert seen == [(7, 2, 0), (7, 2, 1), (7, 2, 2)]
     assert context["horizon"] == 7 and nested == {"limits": [1, 2]}
+
+
+@pytest.mark.parametrize("space", [Discrete(3), Box(0.0, 1.0, (2, 2)), gym.spaces.Dict({"x": Discrete(2)})])
+def test_observations_that_are_no_vectors_are_refused(space: Any) -> None:
+    env = Pair()
+    env.observation_space = lambda agent: space  # type: ignore[method-assign]
+    for stacked in (StackedEnv([env]), WithAgentIds(StackedEnv([env]))):
+        with pytest.raises(ValueError, match=r"observation space of agent 'a' is (Discrete|Box|Dict).*flatten it"):
+            Team.of(stacked, with_state=False)
 
 
 # Who terminated.

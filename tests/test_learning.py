@@ -151,7 +151,7 @@ class CueGame(Game):
 
 @pytest.mark.parametrize(
     ("algorithm", "memory"),
-    [("maddpg-lstm", {}), ("maddpg", {}), ("maddpg-lstm", {"seq_length": 1, "stored_state": True})],
+    [("maddpg-lstm", {"seq_length": 3}), ("maddpg", {}), ("maddpg-lstm", {"seq_length": 1, "stored_state": True})],
 )
 def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str, memory: dict[str, Any]) -> None:
     """Without memory the last actions agree with the cue half of the time.
@@ -165,7 +165,6 @@ def test_a_cue_from_the_past_needs_memory(ray_session: None, algorithm: str, mem
         critic_lr=2e-3,
         critic_state="world",
         train_batch_size_per_learner=64,
-        seq_length=3,
         exploration={"epsilon": 0.3, "noise": 0.2, "decay": 0.0},
         updates_per_env_step=0.15,
         tau=0.05,

@@ -316,6 +316,20 @@ def test_the_teams_value_goes_on_until_all_agents_terminate() -> None:
     assert torch.equal(batch.team_discount, torch.where(ended == N, 0.0, G)[:, None])
 
 
+def test_a_buffer_saved_with_one_flag_for_all_is_read() -> None:
+    simulator = Simulator(2)
+    buffer = JointReplayBuffer(64, N, O, A, seed=0)
+    fragment = simulator.fragment(20)
+    fragment["terminated"] = np.repeat(fragment["terminated"].all(-1, keepdims=True), N, axis=-1)
+    buffer.add(**fragment)
+    state = buffer.get_state()
+    state["columns"]["terminated"] = state["columns"]["terminated"][:, :1].astype(np.float32)
+    restored = JointReplayBuffer(64, N, O, A, seed=1)
+    restored.set_state(state)
+    first, second = drawn(buffer, (100,), gamma=G), drawn(restored, (100,), gamma=G)
+    assert all(torch.equal(first[k], second[k]) for k in first) and 0 < (first["discount"] == 0).sum()
+
+
 def test_who_terminated_takes_a_byte_for_each_agent() -> None:
     buffer = JointReplayBuffer(500, N, O, A)
     assert buffer._columns["terminated"].nbytes == 500 * N

@@ -295,12 +295,11 @@ class JointAlgorithm(AnyPath, Algorithm):
 
     def _use_modules(self, *args: Any, **kwargs: Any) -> Any:
         """Takes the place of what RLlib has for policies, of which there are none on its new API stack."""
-        agent = self.config.team.agents[0]
         raise NotImplementedError(
             "There are no policies on RLlib's new API stack: take an agent's module, module = "
             f"algo.get_module({self.config.module_ids[0]!r}), and act with "
-            'module.forward_inference({"obs": obs})["actions"], observations (B, O) to actions (B, A) in [-1, 1]; '
-            f"{agent!r} is the first of the agents."
+            'module.forward_inference({"obs": obs})["actions"], observations (B, O) to actions (B, A) in [-1, 1], '
+            "which ray.rllib.utils.spaces.space_utils.unsquash_action scales to the bounds of a space."
         )
 
     get_policy = compute_single_action = compute_actions = add_policy = remove_policy = _use_modules

@@ -87,8 +87,9 @@ class WithAgentIds:
         zeros, ones = np.zeros(len(env.agents), np.float32), np.ones(len(env.agents), np.float32)
         self.observation_spaces: dict[str, gym.Space[Any]] = {
             agent: gym.spaces.Box(np.append(zeros, space.low), np.append(ones, space.high), dtype=np.float32)
+            if isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+            else space  # not legal: `Team.of` says so
             for agent, space in env.observation_spaces.items()
-            if isinstance(space, gym.spaces.Box)
         }
         self.id_layout: Layout = (Entities("agent_id", 1, len(env.agents)),)
         layouts: dict[str, Groups] = {

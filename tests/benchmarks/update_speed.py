@@ -41,8 +41,12 @@ def config_of(algorithm: str, shape: str, critic_state: str, compiled: bool = Tr
     env, batch_size, seq_length, *_ = SHAPES[shape]
     config = maobs.ALGORITHMS[algorithm]()
     config.environment(env, env_config={"action_mode": "discrete"} if needs_discrete(config) else {})
-    config.training(train_batch_size_per_learner=batch_size, replay_buffer_capacity=50_000, critic_state=critic_state)
-    config.training(seq_length=seq_length).framework(torch_compile_learner=compiled)
+    config.training(train_batch_size_per_learner=batch_size, replay_buffer_capacity=50_000)
+    config.framework(torch_compile_learner=compiled)
+    if config.uses_state:
+        config.training(critic_state=critic_state)
+    if config.recurrent:
+        config.training(seq_length=seq_length)
     return config.reporting(min_sample_timesteps_per_iteration=400).debugging(seed=0)
 
 
