@@ -198,7 +198,7 @@ def test_episodes_that_do_not_count_are_not_shown(ray_session: None) -> None:
     assert names.count("on_episode_step") == 15
 
 
-def test_training_and_evaluation_call_them_in_every_process(ray_session: None) -> None:
+def test_training_and_evaluation_call_them(ray_session: None) -> None:
     """On the package's own environment, which has no infos: the metrics of an episode are in its last ones."""
 
     class Marks(RLlibCallback):
@@ -209,11 +209,10 @@ def test_training_and_evaluation_call_them_in_every_process(ray_session: None) -
         def on_episode_end(self, *, episode: Any, env_runner: Any, metrics_logger: Any, **given: Any) -> None:
             assert sorted(episode.agent_ids) == self.agents
             assert "collisions_agents" in episode.get_infos(-1)["agent_0"]["episode_metrics"]
-            metrics_logger.log_value("worker", env_runner.worker_index, window=1)
             metrics_logger.log_value("in_evaluation", float(env_runner.config.in_evaluation), window=1)
 
     config = small_config("maddpg", horizon=10).callbacks(Marks)
-    config.env_runners(num_env_runners=1, rollout_fragment_length=10).training(agent_id_input=True)
+    config.training(agent_id_input=True)
     config.evaluation(evaluation_interval=1, evaluation_duration=2)
     algo = config.build_algo()
     try:
@@ -221,8 +220,7 @@ def test_training_and_evaluation_call_them_in_every_process(ray_session: None) -
     finally:
         algo.stop()
     training, evaluation = result["env_runners"], result["evaluation"]["env_runners"]
-    assert (training["worker"], training["in_evaluation"]) == (1, 0)
-    assert (evaluation["worker"], evaluation["in_evaluation"]) == (0, 1)
+    assert (training["in_evaluation"], evaluation["in_evaluation"]) == (0, 1)
 
 
 def test_stock_episode_metrics_callback_changes_nothing(ray_session: None) -> None:
@@ -238,9 +236,17 @@ def test_stock_episode_metrics_callback_changes_nothing(ray_session: None) -> No
 
 
 def test_a_dict_environment_is_what_callbacks_get(ray_session: None) -> None:
-    """Behind agent ids, too."""
+    """Behind agent ids and another order of the agents, too."""
     found: list[Any] = []
-    tune.register_env("lamp", Lamp)
+    made: list[Lamp] = []
+
+    def make(config: dict) -> Lamp:
+        made.append(Lamp(config))
+        if len(made) > 1:  # the first one says which order is the team's
+            made[-1].possible_agents = ["right", "left"]
+        return made[-1]
+
+    tune.register_env("lamp", make)
     config = small_config("maddpg").environment("lamp").training(agent_id_input=True)
     config.callbacks(on_environment_created=lambda *, env, **given: found.extend(env.envs)).validate()
     JointEnvRunner(config=config, worker_index=0, num_workers=0)

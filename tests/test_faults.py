@@ -34,6 +34,8 @@ class Faulty(Lamp):
         self.config = dict(config)
         self.bad = len(MADE) < self.config.get("bad_copies", 10**9) and not os.path.exists(self.config.get("flag", ""))
         MADE.append(self)
+        if self.config.get("what") == "unmade" and getattr(config, "worker_index", 0):
+            raise KeyError("no lidar")
 
     def step(self, actions: dict) -> tuple:
         result = super().step(actions)
@@ -83,6 +85,12 @@ def test_what_goes_wrong_in_remote_runners(ray_session: None, tmp_path: Path) ->
     )
     override = maobs.JointConfig.overrides(env_config={"at": 2, "what": "lidar"}, explore=False)
     config.evaluation(evaluation_num_env_runners=1, evaluation_duration=2, evaluation_config=override)
+    # Callbacks are called in other processes, too.
+    config.callbacks(
+        on_episode_end=lambda *, episode, env_runner, metrics_logger, **given: metrics_logger.log_value(
+            "length", len(episode) * env_runner.worker_index, window=1
+        )
+    )
     algo = config.build_algo()
 
     def change(**settings: Any) -> None:
@@ -102,7 +110,8 @@ def test_what_goes_wrong_in_remote_runners(ray_session: None, tmp_path: Path) ->
             algo.evaluate()
         # The same algorithm goes on, and its runners come back: after an error, and after a crash as a new process.
         change(what="nothing")
-        assert algo.train()["num_env_steps_sampled_lifetime"] >= 40
+        result = algo.train()
+        assert result["num_env_steps_sampled_lifetime"] >= 40 and result["env_runners"]["length"] == 5
         assert algo.env_runner_group.num_healthy_remote_workers() == 1
         change(what="crash")
         algo.train()
@@ -166,11 +175,8 @@ def test_environments_made_anew_play_other_episodes(ray_session: None) -> None:
     def starts(restarts: int) -> np.ndarray:
         config = small_config("maddpg").fault_tolerance(restart_failed_sub_environments=True)
         runner = runner_of(config)
-        first = runner.env.step
-        for _ in range(restarts):
+        if restarts:
             runner.env.step = lambda actions: 1 / 0
-            runner._advance([[]], False, False)
-            assert runner.env.step != first
         return runner.sample(num_timesteps=2)[0].obs[0]
 
     assert np.array_equal(starts(1), starts(1)) and not np.array_equal(starts(0), starts(1))
@@ -185,6 +191,19 @@ def test_failures_without_an_episode_in_between_are_counted(ray_session: None) -
         for _ in range(100):
             runner.sample()
     assert len(MADE) == 2 * 4
+
+
+def test_an_environment_that_a_remote_runner_cannot_make_reaches_the_caller(ray_session: None) -> None:
+    config = config_of(1, what="unmade").fault_tolerance(num_consecutive_env_runner_failures_tolerance=2)
+    runner = runner_of(config, 1)
+    runner.assert_healthy()
+    assert isinstance(runner.error, KeyError) and len(MADE) == 1
+    # As after a crash, when there is no algorithm to be built that would ask.
+    with pytest.raises(KeyError, match="no lidar"):
+        runner.sample()
+    assert len(MADE) == 4
+    with pytest.raises(KeyError, match="no lidar"):
+        config.build_algo()
 
 
 def test_other_errors_are_left_to_rllib(ray_session: None) -> None:

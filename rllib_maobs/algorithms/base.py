@@ -38,7 +38,7 @@ from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
 from rllib_maobs.learner import JointLearner
 from rllib_maobs.paths import AnyPath, absolute
 from rllib_maobs.replay import JointReplayBuffer
-from rllib_maobs.runner import JointSample, raised_as_themselves
+from rllib_maobs.runner import JointSample, raise_kept, raised_as_themselves
 
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many.
@@ -85,6 +85,8 @@ class JointAlgorithm(AnyPath, Algorithm):
             device=self._learner.device,
         )
         for group in (self.env_runner_group, self.eval_env_runner_group):
+            if group is not None:
+                raise_kept(group)  # of environments that could not be made
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
         self._rounds_without_samples = 0

@@ -102,8 +102,16 @@ HONOURED: dict[str, str] = {
     **_each("min_train_timesteps_per_iteration", "rows of minibatches"),
     **_each("min_sample_timesteps_per_iteration", "how long an iteration's rounds of sampling and updates go on"),
     **_each("log_level seed"),
-    **_each("restart_failed_env_runners ignore_env_runner_failures max_num_env_runner_restarts"),
-    **_each("delay_between_env_runner_restarts_s num_consecutive_env_runner_failures_tolerance"),
+    **_each(
+        "restart_failed_env_runners",
+        "after a crash of its process; after an error of its environment that alone is made anew (callbacks.md)",
+    ),
+    **_each(
+        "restart_failed_sub_environments",
+        "all copies of the runner together, as often as failures are tolerated (callbacks.md)",
+    ),
+    **_each("ignore_env_runner_failures max_num_env_runner_restarts delay_between_env_runner_restarts_s"),
+    **_each("num_consecutive_env_runner_failures_tolerance"),
     **_each("env_runner_health_probe_timeout_s env_runner_restore_timeout_s"),
     **_each("_validate_config", "leaves RLlib's own checks out; those of this package find the team and stay"),
 }
@@ -127,7 +135,8 @@ _OLD = "it belongs to RLlib's old API stack"
 _TENSORFLOW = "it belongs to TensorFlow, and networks here are PyTorch's"
 _OFFLINE = "learning from recorded data is not offered: a JointReplayBuffer can be filled and sampled by hand"
 _CONNECTORS = (
-    "joint columns have no connector pipelines; use training(normalize_observations=True), or wrap the environment"
+    "joint columns have no connector pipelines; use training(normalize_observations=True), a recurrent actor for the "
+    "last observations together, or wrap the environment (docs/callbacks.md)"
 )
 _LEARNER = "the one learner is in the algorithm's process; use num_env_runners for more samples"
 _PASSES = "use training(updates_per_env_step=...): each update takes a minibatch of its own from replay"
@@ -219,7 +228,7 @@ REFUSED: dict[str, str] = {
         "output output_config output_compress_columns output_max_file_size output_max_rows_per_file "
         "output_write_remaining_data output_write_method output_write_method_kwargs output_filesystem "
         "output_filesystem_kwargs output_write_episodes",
-        "samples are not written to files; a checkpoint holds the replay buffer",
+        "there are no episodes to write; a callback on_sample_end gets all that is sampled (docs/callbacks.md)",
     ),
     # multi_agent, reporting, checkpointing, debugging, fault_tolerance, experimental
     **_each("policies_to_train", "all agents of the team are trained"),
@@ -233,7 +242,6 @@ REFUSED: dict[str, str] = {
     **_each("metrics_episode_collection_timeout_s fake_sampler export_native_model_files", _OLD),
     **_each("log_gradients", "gradients are not reported; a learner of your own can log them"),
     **_each("checkpoint_trainable_policies_only", "all policies are trained"),
-    **_each("restart_failed_sub_environments", "copies share one process; use restart_failed_env_runners"),
     **_each(
         "_use_msgpack_checkpoints _disable_preprocessor_api _disable_action_flattening "
         "_disable_initialize_loss_from_dummy_batch",

@@ -62,6 +62,11 @@ class InOrder:
         """Closes every copy."""
         self._env.close()
 
+    @property
+    def unwrapped(self) -> JointEnv:
+        """The environment in its own order."""
+        return self._env
+
 
 class WithAgentIds:
     """An environment whose observations begin with the agent's number as a one-hot vector.

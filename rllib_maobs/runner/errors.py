@@ -55,12 +55,11 @@ def raised_as_themselves(group: Any) -> Iterator[None]:
     failed = sorted(healthy - set(group.healthy_env_runner_ids())) if healthy else []
     if not failed:
         return
-    raised = group.foreach_env_runner(
-        lambda runner: runner.error,
-        local_env_runner=False,
-        healthy_only=False,
-        remote_worker_ids=failed,
-        timeout_seconds=_ANSWER_S,
-    )
-    if raised := [error for error in raised if error is not None]:
-        raise raised[0]
+    raise_kept(group, healthy_only=False, remote_worker_ids=failed, timeout_seconds=_ANSWER_S)
+
+
+def raise_kept(group: Any, **whom: Any) -> None:
+    """Raises the first error that a group's remote runners have kept, if one has; `whom` says which are asked."""
+    kept = group.foreach_env_runner(lambda runner: runner.error, local_env_runner=False, **whom)
+    if errors := [error for error in kept if error is not None]:
+        raise errors[0]

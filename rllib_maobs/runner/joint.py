@@ -100,10 +100,15 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._callbacks = Callbacks(self)
         self._obs: NDArray[np.float32] | None = None
         self._needs_reset = True
-        if self.worker_index is None or self.worker_index > 0 or self.num_workers == 0:
-            self.make_env()
-        elif self.config.create_env_on_local_worker:
-            self.make_env()
+        local = self.worker_index == 0
+        if not local or self.num_workers == 0 or self.config.create_env_on_local_worker:
+            try:
+                self.make_env()
+            except Exception as error:
+                if not self.worker_index:
+                    raise
+                # The algorithm asks for it: RLlib would build an algorithm without this runner, or fail elsewhere.
+                self.error = portable(error, f"env runner {self.worker_index}")
         self.module: MultiRLModule | None = None
         self._weights_seq_no = 0
         self.make_module()
@@ -124,14 +129,18 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     @override(EnvRunner)
     def make_env(self) -> None:
         """Makes the E copies anew; they are reset at the next `sample()`."""
+        self._close_env()
+        self.env = make_env(self.config, self.num_envs, self.worker_index or 0, self.team)
+        self._obs, self._needs_reset = None, True
+        self._callbacks.on_environment_created()
+
+    def _close_env(self) -> None:
         if self.env is not None:
             try:
                 self.env.close()
             except Exception as error:  # it may be closed because it is broken
                 logger.warning("The environment of runner %s could not be closed: %r", self.worker_index, error)
-        self.env = make_env(self.config, self.num_envs, self.worker_index or 0, self.team)
-        self._obs, self._needs_reset = None, True
-        self._callbacks.on_environment_created()
+        self.env = None
 
     @override(EnvRunner)
     def make_module(self) -> None:
@@ -175,7 +184,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             Exception: Whatever the environment raises, if RLlib's settings of fault tolerance do not let it be made
                 anew (any more).
         """
-        if self.env is None:
+        if self.env is None and self.error is None:
             raise ValueError(f"{self} has no environment, so it cannot sample.")
         if num_timesteps is not None and num_episodes is not None:
             raise ValueError("Give either num_timesteps or num_episodes, not both.")
@@ -255,6 +264,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             Whether it was a step.
         """
         try:
+            if self.env is None:
+                self._make_env_or_fail()
             if self._needs_reset:
                 self._reset_all()
             start = self._steps_sampled
@@ -262,12 +273,18 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             return True
         except EnvError as error:
             assert isinstance(error.__cause__, Exception)
-            self._make_env_anew(error.__cause__)
+            self._give_up_env(error.__cause__)
             parts.append([])
             return False
 
-    def _make_env_anew(self, error: Exception) -> None:
-        """Makes the environment anew after an error of its own, or raises it if RLlib's settings do not allow that."""
+    def _make_env_or_fail(self) -> None:
+        try:
+            self.make_env()
+        except Exception as error:
+            raise EnvError from error
+
+    def _give_up_env(self, error: Exception) -> None:
+        """After an error of the environment it is to be made anew; raises the error if RLlib's settings are spent."""
         config = self.config
         self._failures += 1
         self._restarts += 1
@@ -285,7 +302,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                 self._failures,
                 limit,
             )
-        self.make_env()
+        self._close_env()
 
     def _step(
         self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None
@@ -405,8 +422,8 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
     @override(EnvRunner)
     def assert_healthy(self) -> None:
-        """Checks that there is something to sample from and to act with."""
-        assert self.env is not None and self.module is not None
+        """Checks that there is something to sample from, or an error that says why not, and something to act with."""
+        assert (self.env is not None or self.error is not None) and self.module is not None
 
     @override(EnvRunner)
     def stop(self) -> None:
