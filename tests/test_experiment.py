@@ -385,7 +385,7 @@ def test_what_all_rows_share_is_given_to_those_it_means_something_to() -> None:
         training={"seq_length": 3, "tau": 0.02},
         variants={"long": {"algorithm": "maddpg", "seq_length": 4}},
     )
-    iddpg, lstm, long = rows.specs(parsed(rows, "--critic-state", "world"))
+    iddpg, lstm, long = rows.specs(parsed(rows, "--critic-state", "world", "--seeds", "0"))
     assert iddpg.training == {"tau": 0.02}
     assert lstm.training == {"seq_length": 3, "tau": 0.02, "critic_state": "world"}
     # But what a row itself says is not taken away from it.

@@ -173,7 +173,7 @@ def test_wrong_settings_end_in_a_sentence(ray_session: None, algorithm: str, cha
     config = small_config(algorithm)
     with pytest.raises(ValueError, match=message):
         change(config)
-        config.build_algo()
+        config.validate()
 
 
 def test_unknown_names_in_a_param_space_are_refused(ray_session: None) -> None:
