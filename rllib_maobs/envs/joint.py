@@ -215,7 +215,6 @@ class StackedEnv:
     without any flag were truncated then.
 
     Attributes:
-        envs: The copies.
         observation_layouts: What each agent's observation is made of, None if the environment does not say.
         state_layout: What its `state()` is made of, None if it does not say.
 
@@ -251,7 +250,7 @@ class StackedEnv:
                     f"The agents of {self._name} are {self.agents} in copy 0, but {theirs} in copy {copy}: legal is "
                     f"the same set of agents in all copies."
                 )
-        self.envs = list(envs)
+        self._envs = list(envs)
         self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._listed = np.zeros(self.num_envs, dtype=np.bool_)  # which ones say in `agents` who is there
@@ -280,7 +279,7 @@ class StackedEnv:
             if mask is not None and not mask[copy]:
                 continue
             self._steps[copy] = 0
-            result = self.envs[copy].reset(seed=None if seed is None else seed[copy])
+            result = self._envs[copy].reset(seed=None if seed is None else seed[copy])
             if not _are(result, (Mapping, Mapping | None)):
                 raise self._error(copy, f"reset() returns {_kinds(result)}", "two dicts by agent: observations, infos")
             self._infos[copy] = result[1] or {}
@@ -288,9 +287,14 @@ class StackedEnv:
             if self._obs is None:
                 self._obs = np.zeros((self.num_envs, *rows.shape), dtype=np.float32)
             self._obs[copy] = rows
-            self._listed[copy] = bool(getattr(self.envs[copy], "agents", None))
+            self._listed[copy] = bool(getattr(self._envs[copy], "agents", None))
         assert self._obs is not None
         return self._obs.copy(), {"infos": list(self._infos)}
+
+    @property
+    def envs(self) -> list[Any]:
+        """The copies, as callbacks know them: `env.envs[env_index]`."""
+        return self._envs
 
     def step(self, actions: Float) -> StepResult:
         """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`.
@@ -307,7 +311,7 @@ class StackedEnv:
         terminated = np.zeros(actions.shape[:2], dtype=np.bool_)
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         metrics: dict[str, Float] = {}
-        for copy, env in enumerate(self.envs):
+        for copy, env in enumerate(self._envs):
             joint = {
                 agent: self._action(self.action_spaces[agent], action)
                 for agent, action in zip(self.agents, actions[copy], strict=True)
@@ -346,7 +350,7 @@ class StackedEnv:
             np.array([bool(flags.get(agent)) for agent in self.agents]) for flags in (terminations, truncations)
         )
         ended, everybody = terminated | truncated, bool(terminations.get("__all__"))
-        emptied = self._listed[copy] and not self.envs[copy].agents
+        emptied = self._listed[copy] and not self._envs[copy].agents
         if ended.all() or everybody or truncations.get("__all__") or emptied:
             return terminated | (everybody & ~truncated)
         if ended.any():
@@ -403,7 +407,7 @@ class StackedEnv:
             ValueError: If they have none, or it changes its size or is not finite; names copy and step.
         """
         rows: list[Float] = []
-        for copy, env in enumerate(self.envs):
+        for copy, env in enumerate(self._envs):
             try:
                 row = np.asarray(env.state(), dtype=np.float32).reshape(-1)
             except (AttributeError, NotImplementedError) as error:
@@ -421,7 +425,7 @@ class StackedEnv:
 
     def close(self) -> None:
         """Closes every copy."""
-        for env in self.envs:
+        for env in self._envs:
             _stepped.pop(id(_innermost(env)), None)
             env.close()
 
