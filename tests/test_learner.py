@@ -1,5 +1,6 @@
 """Losses, gradients and updates against the equations; routing; options; sharing; compiled against eager."""
 
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -319,6 +320,24 @@ def test_every_batch_size_is_compiled_on_its_own(make_learner: MakeLearner) -> N
         want, _ = eager_gradients(compiled, batch)
         for role, views in compiled.gradients(batch)[0].items():
             torch.testing.assert_close(views, want[role], rtol=1e-4, atol=1e-5)
+
+
+def test_weights_that_another_thread_takes_are_from_between_updates(make_learner: MakeLearner) -> None:
+    learner = make_learner(small_config("maddpg"))
+    states = list[dict[str, Any]]()
+    thread = threading.Thread(target=lambda: states.append(learner.get_state()))
+    step = learner.step
+
+    def slow(minibatch: Batch) -> torch.Tensor:
+        if not thread.ident:
+            thread.start()
+        thread.join(0.05)
+        return step(minibatch)
+
+    learner.step = slow  # type: ignore[method-assign]
+    learner.update(repeated(random_batch(learner.config), 3))
+    thread.join()
+    assert states[0]["progress"]["updates"] == 3
 
 
 def test_targets_start_equal_to_the_online_networks(ray_session: None) -> None:

@@ -190,7 +190,6 @@ def test_faces_name_the_agent_of_an_illegal_action(face):
         ("tunnel", {"gap": 0.14}, r"radius 0.075 do not fit through a gap of 0.14 .* more than 0.010 is missing"),
         ("simple-tunnel", {"agent_radius": 0.2}, r"more than 0.150 is missing; use a wider gap or smaller agents"),
         ("tunnel", {"spacing": 0.1}, r"agent_0 and agent_1 do not fit: 0.050 of room is missing between them"),
-        ("tunnel", {"start_noise": 0.1}, r"agent_0 and agent_1 do not fit: 0.133 of room"),
         ("tunnel", {"target_distance": 0.1}, r"obstacle_0 and target_0 do not fit: 0.244 of room"),
         ("simple-tunnel", {"start_distance": 1.35}, r"agent_0 does not fit in the room: 0.025 is missing along x"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
@@ -67,6 +68,8 @@ class JointLearner(TorchLearner):
         super().__init__(**kwargs)
         # RLlib would compile forward_train, which a stacked update never calls; what is compiled is ours.
         self._torch_compile_forward_train = self._torch_compile_complete_update = False
+        # With evaluation_parallel_to_training RLlib takes the weights in another thread than it trains in.
+        self._updating = threading.Lock()
         self._sum: Tensor | None = None
         self._updates = self._actor_updates = 0
         self._updates_lifetime = self._env_steps = 0
@@ -367,7 +370,7 @@ class JointLearner(TorchLearner):
         if self._draw is not None:
             noise = self._draw(whole.actions.shape, generator=self._generator)
             whole = whole._replace(noise=noise.to(whole.actions.device))
-        with denormals_are_zero():
+        with self._updating, denormals_are_zero():
             for minibatch in whole.unbind():
                 report = self.step(minibatch)
                 self._sum = report.clone() if self._sum is None else self._sum.add_(report)
@@ -414,7 +417,8 @@ class JointLearner(TorchLearner):
     @override(Learner)
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """RLlib's state, the number of updates made and the random numbers to come."""
-        state: dict[str, Any] = super().get_state(*args, **kwargs)
+        with self._updating:
+            state: dict[str, Any] = super().get_state(*args, **kwargs)
         generator = self._generator.get_state().numpy()
         state[_PROGRESS] = {
             "updates": self._updates_lifetime,
