@@ -30,7 +30,7 @@ experiment = Experiment(
             "updates_per_env_step": 1 / 8,
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
-            "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),
+            "exploration": fading(epsilon=0.1, noise=0.2, final=0.05),
             "env_config": {"action_mode": "force"},
             "train_horizon": 25,
             "num_envs_per_env_runner": 32,
