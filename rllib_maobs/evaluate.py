@@ -41,6 +41,7 @@ LABELS = {
     "path_efficiency": ("path efficiency", "{:.2f}"),
 }
 _AT_ONCE = 100  # copies; more would be slower, for want of cache
+_PAIRS = 1_000_000  # of bodies, in all copies at once: some hundred megabytes
 BASELINES = ("random", "heuristic")
 
 
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     paths = list(dict.fromkeys(text for text in args.checkpoints if text not in pairs))
     files = [path for path in (args.json, args.csv, args.per_episode, args.record) if path is not None]
     try:
-        check_arguments(args.episodes, args.num_agents, files, paths)
+        check_arguments(args.episodes, args.num_agents, files, paths, parse_options(pairs))
         recorder = Recorder(args.record) if args.record else None
         jobs = [
             job for path in paths for job in jobs_of(path, args.env, args.num_agents, parse_options(pairs), args.seed)
@@ -108,8 +109,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"written: {args.record}")
 
 
-def check_arguments(episodes: int, sizes: Sequence[int], files: Sequence[Path], checkpoints: Sequence[str]) -> None:
+def check_arguments(
+    episodes: int, sizes: Sequence[int], files: Sequence[Path], checkpoints: Sequence[str], options: Mapping[str, Any]
+) -> None:
     """Raise a ValueError for what is wrong on the command line."""
+    if sizes and (both := {"num_agents", "num_predators"} & {*options}):
+        raise ValueError(f"--num-agents and {both.pop()}=... say the same: give one of them")
+    if "scenario" in options:
+        raise ValueError("scenario=... is no option of a task: use --env")
+    if len({path.absolute() for path in files}) < len(files):
+        raise ValueError("two of --json, --csv, --per-episode and --record name the same file")
     if episodes < 2:
         raise ValueError(f"--episodes {episodes} is illegal; legal: an integer >= 2")
     if wrong := [size for size in sizes if size < 1]:
@@ -205,8 +214,10 @@ def _evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFram
     """Play all episodes of one policy on one task, so many copies at once as are quick."""
     print(f"{task.env}, {task.num_agents} agents: {policy} ...", file=sys.stderr, flush=True)
     rows, done = [], 0
+    bodies = sum(group.count for group in make_scenario(task.env, **task.options).bodies())
+    at_once = max(1, min(_AT_ONCE, _PAIRS // bodies**2))
     while done < episodes:
-        env = make_vec(task.env, num_envs=min(_AT_ONCE, episodes - done), **task.options)
+        env = make_vec(task.env, num_envs=min(at_once, episodes - done), **task.options)
         rows.append(play_episodes(env, make_policy(env, policy, seed + done), seed + done))
         done += env.num_envs
     labels = {"env": task.env, "agents": task.num_agents, "options": json.dumps(task.options), "policy": policy}

@@ -236,3 +236,11 @@ def test_runners_that_never_come_back_end_the_training(ray_session: None, monkey
         algo.train()
     assert len(rounds) == 4
     algo.stop()
+
+
+def test_an_error_of_a_callback_at_a_samples_end_reaches_the_caller(ray_session: None) -> None:
+    config = small_config("iddpg").env_runners(num_env_runners=1, num_cpus_per_env_runner=0.5)
+    algo = config.callbacks(on_sample_end=lambda **given: {}["what I wanted"]).build_algo()
+    with pytest.raises(KeyError, match="what I wanted"):
+        algo.train()
+    algo.stop()

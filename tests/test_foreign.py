@@ -144,6 +144,23 @@ def test_states_are_checked() -> None:
         StackedEnv([NoState()]).state()
 
 
+def test_copies_have_the_same_spaces() -> None:
+    with pytest.raises(ValueError, match=r"The spaces of Pair are .* in copy 0, but .* in copy 1: legal are the same"):
+        StackedEnv([Pair(), Pair(space=Box(-2.0, 2.0, (2,), np.float32))])
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"a": "False", "b": False}, "the termination or truncation of 'a' is 'False' in environment copy 0 at step 1"),
+        ({"a": False, "b": False, "__ALL__": False}, "the termination or truncation of '__ALL__' is False"),
+    ],
+)
+def test_flags_are_flags_of_agents(flags: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        played(StackedEnv([Pair(lambda env, obs, reward, terminated, *rest: (obs, reward, flags, *rest))]), 1)
+
+
 def test_infos_of_none_say_nothing() -> None:
     for infos in ({"a": None, "b": None}, None):
         *_, last = played(StackedEnv([Pair(lambda env, *rest, infos=infos: (*rest[:-1], infos))]))

@@ -11,6 +11,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module import MultiRLModuleSpec, RLModuleSpec
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
+from ray.rllib.policy.policy import PolicySpec
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_TRAINED_LIFETIME
 
 import rllib_maobs as maobs
@@ -338,3 +339,78 @@ def test_policies_differ_in_exploration_and_nothing_else(ray_session: None) -> N
     overrides = {"agent_1": maobs.JointConfig.overrides(exploration={"noise": 0.7})}
     learner = build_learner(small_config("maddpg").rl_module(algorithm_config_overrides_per_module=overrides))
     assert [learner.module[m].exploration.noise for m in learner.config.module_ids] == [0.1, 0.7, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"training": {"actor_lr": 5.0}},
+            "'training' is part of IDDPGConfig, not a setting",
+        ),
+        ({"_foo": 1}, "IDDPGConfig has no setting '_foo'"),
+        ({"explore": "no"}, "explore='no' is illegal; legal: True or False"),
+        ({"evaluation_interval": 1.5}, "evaluation_interval=1.5 is illegal; legal: an integer >= 0"),
+        ({"actor_lr": [[0, float("nan")], [10, 1e-4]]}, "actor_lr=.* is illegal; legal: a number > 0, or a schedule"),
+        ({"critic_lr": [[5, 1e-3]]}, "critic_lr=.* is illegal; legal: .* that begins with step 0"),
+    ],
+)
+def test_what_is_no_setting_or_no_legal_value_is_named(given: dict[str, Any], message: str) -> None:
+    config = small_config("iddpg")
+    config.update_from_dict(given)
+    with pytest.raises(ValueError, match=message):
+        config.validate()
+
+
+def test_policies_need_a_mapping_and_a_mapping_holds_whatever_they_are_called() -> None:
+    shared = small_config("iddpg").multi_agent(
+        policies={"default_policy"}, policy_mapping_fn=lambda agent, *args, **kwargs: "default_policy"
+    )
+    shared.validate()
+    assert shared.module_ids == ("default_policy",) * 3  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"agents are mapped to .'agent_0': 'x', 'agent_1': 'x'"):
+        small_config("iddpg").multi_agent(policy_mapping_fn=lambda agent, *args, **kwargs: "x").validate()
+    with pytest.raises(ValueError, match=r"has \['a', 'b'\], but no policy_mapping_fn: say which agent has which"):
+        small_config("iddpg").multi_agent(policies={"a", "b"}).validate()
+    agents = {agent: PolicySpec(config={"actor_lr": 3.0}) for agent in ("agent_0", "agent_1", "agent_2")}
+    own = small_config("iddpg").multi_agent(policies=agents, policy_mapping_fn=lambda agent, *args, **kwargs: agent)
+    with pytest.raises(ValueError, match=r"has a config, .*, which RLlib's new API stack does not read"):
+        own.validate()
+
+
+def test_what_a_restored_run_is_told_anew_holds_from_there_on(ray_session: None, tmp_path: Path) -> None:
+    def config(**options: Any) -> Any:
+        config = small_config("iddpg", **options).training(num_steps_sampled_before_learning_starts=16)
+        config.training(train_batch_size_per_learner=8).env_runners(num_envs_per_env_runner=2)
+        return config.reporting(min_sample_timesteps_per_iteration=32)
+
+    algo = config(horizon=5).build_algo()
+    for _ in range(4):
+        algo.train()
+    path = algo.save_to_path(str(tmp_path))
+    assert algo._progress["updates"] == 112
+    with pytest.raises(ValueError, match=r"There are no weights 'agent_9'; modules are"):
+        algo.set_weights({"agent_9": {}})
+    with pytest.raises(ValueError, match=r"There are no weights 'agent_0.x'"):
+        algo.set_weights({"agent_0": {"x": 1}})
+    algo.stop()
+    other = config(horizon=8).training(updates_per_env_step=0.25).build_algo()
+    other.restore_from_path(path)
+    lengths = [other.train()["env_runners"]["episode_len_mean"] for _ in range(3)]
+    assert lengths[-1] == 8.0
+    assert other._progress["updates"] == 3 * 32 // 4
+    other.stop()
+
+
+def test_remote_runners_do_not_repeat_the_first_episodes_after_a_restore(ray_session: None, tmp_path: Path) -> None:
+    def first(runner: Any) -> list[float]:
+        observed: list[float] = runner.sample()[0].obs[0, 0, 0].tolist()
+        return observed
+
+    config = small_config("iddpg").env_runners(num_env_runners=1, num_cpus_per_env_runner=0.5)
+    algo = config.build_algo()
+    path = algo.save_to_path(str(tmp_path))
+    fresh = algo.env_runner_group.foreach_env_runner(first, local_env_runner=False)
+    algo.restore_from_path(path)
+    assert algo.env_runner_group.foreach_env_runner(first, local_env_runner=False) != fresh
+    algo.stop()

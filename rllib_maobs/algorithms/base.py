@@ -90,7 +90,19 @@ class JointAlgorithm(AnyPath, Algorithm):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
         self._rounds_without_samples = 0
-        self._progress = {"env_steps": 0, "updates": 0, "learning_starts": self._steps_before_learning()}
+        self._progress: dict[str, Any] = {
+            "env_steps": 0,
+            "updates": 0,
+            "learning_starts": self._steps_before_learning(),
+        }
+        self._progress["updates_per_env_step"] = self.config.updates_per_env_step
+
+    def _owe_from_now_on(self) -> None:
+        """Counts updates from here if `updates_per_env_step` has changed since they were counted last."""
+        ratio = self.config.updates_per_env_step
+        if self._progress.setdefault("updates_per_env_step", ratio) != ratio:
+            starts = max(self._progress["env_steps"], self._progress["learning_starts"])
+            self._progress |= {"updates_per_env_step": ratio, "learning_starts": starts, "updates": 0}
 
     def _steps_before_learning(self) -> int:
         return max(self.config.num_steps_sampled_before_learning_starts, self.config.train_batch_size_per_learner)
@@ -267,6 +279,13 @@ class JointAlgorithm(AnyPath, Algorithm):
             self._send_weights()
         if "progress" in state:
             self._progress = dict(state["progress"])
+            self._owe_from_now_on()
+            for group in (self.env_runner_group, self.eval_env_runner_group):
+                if group is not None and group.num_remote_workers() > 0:  # their episodes are in no checkpoint
+                    steps = self._progress["env_steps"]
+                    group.foreach_env_runner(
+                        lambda runner, steps=steps: runner.begin_anew(steps), local_env_runner=False
+                    )
         if COMPONENT_REPLAY_BUFFER in state:
             self.replay_buffer.set_state(state[COMPONENT_REPLAY_BUFFER])
         if len(self.replay_buffer) < min(self.config.train_batch_size_per_learner, self._progress["env_steps"]):
@@ -285,7 +304,16 @@ class JointAlgorithm(AnyPath, Algorithm):
 
     @override(Algorithm)
     def set_weights(self, weights: dict[str, dict[str, Any]]) -> None:
-        """Sets the weights of modules, as `get_weights()` gives them, here and in all runners."""
+        """Sets the weights of modules, as `get_weights()` gives them, here and in all runners.
+
+        Raises:
+            ValueError: If there is a module or a parameter of another name.
+        """
+        own = self.get_weights()
+        for module, parameters in weights.items():
+            unknown = [module] if module not in own else [f"{module}.{p}" for p in parameters if p not in own[module]]
+            if unknown:
+                raise ValueError(f"There are no weights {unknown[0]!r}; modules are {sorted(own)}, see get_weights().")
         self.set_state({COMPONENT_LEARNER_GROUP: {COMPONENT_LEARNER: {COMPONENT_RL_MODULE: weights}}})
 
     @override(Algorithm)

@@ -184,9 +184,23 @@ def inspect_team(config: JointConfig) -> Team:
 def map_policies(config: JointConfig) -> tuple[str, ...]:
     """Every agent's policy, in the team's order; one each if none are configured."""
     team = config.team
-    if not config.is_multi_agent:
+    default = type(config)()
+    mapped = config.policy_mapping_fn is not default.policy_mapping_fn
+    if not config.is_multi_agent and not mapped:
         policies = {agent: PolicySpec() for agent in team.agents}
         config.multi_agent(policies=policies, policy_mapping_fn=own_policy)
+    elif not mapped:
+        raise ValueError(
+            f"multi_agent(policies=...) has {sorted(config.policies)}, but no policy_mapping_fn: say which agent has "
+            f"which, e.g. policy_mapping_fn=lambda agent, *args, **kwargs: agent."
+        )
+    for policy, spec in config.policies.items():
+        if isinstance(spec, PolicySpec) and spec.config:
+            raise ValueError(
+                f"The PolicySpec of {policy!r} has a config, {spec.config}, which RLlib's new API stack does not read: "
+                f"policies may differ in exploration, by multi_agent(algorithm_config_overrides_per_module=...), and "
+                f"in networks, by rl_module(rl_module_spec=...)."
+            )
     module_ids = tuple(config.policy_mapping_fn(agent, None) for agent in team.agents)
     mapping = dict(zip(team.agents, module_ids, strict=True))
     if set(module_ids) != set(config.policies):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -34,6 +35,11 @@ LEGAL: dict[str, Any] = {
     "num_gpus_per_learner": NonNegativeInt | NonNegative,
     "metrics_num_episodes_for_smoothing": PositiveInt,
     "seed": NonNegativeInt | None,
+    "explore": bool,
+    "torch_compile_learner": bool,
+    "evaluation_interval": NonNegativeInt | None,
+    "sample_timeout_s": Positive | None,
+    "min_sample_timesteps_per_iteration": NonNegativeInt | None,
     "updates_per_env_step": NonNegative,
     "critic_state": Literal["observations", "world"],
     "seq_length": PositiveInt,
@@ -336,6 +342,23 @@ def check_values(config: JointConfig) -> None:
             setattr(config, name, plain(value))
     for name, hint in config.legal.items():
         setattr(config, name, check_value(getattr(config, name), hint, name, type(config).__name__))
+    for name in ("actor_lr", "critic_lr"):
+        check_schedule(name, getattr(config, name, 0.0))
+
+
+def check_schedule(name: str, rate: Any) -> None:
+    """Raises a ValueError unless a learning rate that is a list is a schedule of RLlib's, of numbers above zero."""
+    if not isinstance(rate, list):
+        return
+    try:
+        legal = all(step >= 0 and math.isfinite(value) and value > 0 for step, value in rate) and rate[0][0] == 0
+    except (TypeError, ValueError, IndexError):
+        legal = False
+    if not legal:
+        raise ValueError(
+            f"{name}={rate} is illegal; legal: a number > 0, or a schedule [[0, 1e-3], [100000, 1e-4], ...] of env "
+            f"steps and numbers > 0 that begins with step 0."
+        )
 
 
 def check_known(config: JointConfig) -> None:
@@ -346,8 +369,13 @@ def check_known(config: JointConfig) -> None:
     """
     defaults = vars(type(config)())
     for name in vars(config):
-        if not (name in defaults or hasattr(type(config), name) or name in _FILLED_IN or name.startswith("_")):
-            raise ValueError(unknown(config, name))
+        if name in defaults or name in _FILLED_IN:
+            continue
+        if callable(getattr(type(config), name, None)):
+            raise ValueError(
+                f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
+            )
+        raise ValueError(unknown(config, name))
     refused = {attribute_of(name): (name, why) for name, why in REFUSED.items()}
     for name, value, default in changed(config):
         # RLlib itself changes `batch_mode` of an evaluation.

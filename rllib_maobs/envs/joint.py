@@ -42,6 +42,7 @@ class InOrder:
             setattr(self, name, getattr(env, name, None))
         self._ours = [env.agents.index(agent) for agent in agents]
         self._theirs = [self.agents.index(agent) for agent in env.agents]
+        self._row = _row_of_agents(getattr(env, "state_layout", None), len(self.agents))
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those of `mask`."""
@@ -55,8 +56,13 @@ class InOrder:
         return obs[:, self._ours], rewards[:, self._ours], terminated, truncated, info
 
     def state(self, kind: str | None = None) -> Float:
-        """The environment's own state `(E, S)`, as it is."""
-        return self._env.state(kind)
+        """The environment's own state `(E, S)`; where its layout begins with the agents, their rows in this order."""
+        state = self._env.state(kind)
+        if self._row == 0:
+            return state
+        end = len(self.agents) * self._row
+        rows = state[:, :end].reshape(len(state), -1, self._row)[:, self._ours]
+        return np.concatenate([rows.reshape(len(state), -1), state[:, end:]], axis=1)
 
     def close(self) -> None:
         """Closes every copy."""
@@ -66,6 +72,16 @@ class InOrder:
     def unwrapped(self) -> JointEnv:
         """The environment in its own order."""
         return self._env
+
+
+def _row_of_agents(layout: Groups | None, num_agents: int) -> int:
+    """How many numbers each agent has at the start of a state; 0 if its layout does not begin with the agents."""
+    found, sizes = 0, set()
+    for _, count, size, *_ in layout or ():
+        if found < num_agents:
+            found += count
+            sizes.add(size)
+    return sizes.pop() if found == num_agents and len(sizes) == 1 else 0
 
 
 class WithAgentIds:
@@ -252,20 +268,29 @@ class StackedEnv:
                 )
         self._envs = list(envs)
         self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
+        self._flagged = {*self.agents, "__all__"}
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._listed = np.zeros(self.num_envs, dtype=np.bool_)  # which ones say in `agents` who is there
         self._obs: Float | None = None
         # RLlib calls them get_observation_space(agent), PettingZoo observation_space(agent).
-        self.observation_spaces, self.action_spaces = (
-            {a: getattr(env, f"get_{which}", None) or getattr(env, which) for a in self.agents}
-            for which in ("observation_space", "action_space")
-        )
-        self.observation_spaces = {a: space(a) for a, space in self.observation_spaces.items()}
-        self.action_spaces = {a: space(a) for a, space in self.action_spaces.items()}
+        self.observation_spaces, self.action_spaces = self._spaces(env)
+        for copy, other in enumerate(envs):
+            if (spaces := self._spaces(other)) != (self.observation_spaces, self.action_spaces):
+                raise ValueError(
+                    f"The spaces of {self._name} are {self.observation_spaces}, {self.action_spaces} in copy 0, but "
+                    f"{spaces[0]}, {spaces[1]} in copy {copy}: legal are the same ones in all copies."
+                )
         self._sizes = {a: int(np.prod(space.shape or ())) for a, space in self.observation_spaces.items()}
         self._size = max(self._sizes.values())
         self.observation_layouts: Mapping[str, Groups | None] | None = getattr(env, "observation_layouts", None)
         self.state_layout: Groups | None = getattr(env, "state_layout", None)
+
+    def _spaces(self, env: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Each agent's spaces of observations and of actions."""
+        observation, action = (
+            getattr(env, f"get_{which}", None) or getattr(env, which) for which in ("observation_space", "action_space")
+        )
+        return {agent: observation(agent) for agent in self.agents}, {agent: action(agent) for agent in self.agents}
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`.
@@ -346,6 +371,11 @@ class StackedEnv:
 
     def _flags(self, terminations: Mapping[str, Any], truncations: Mapping[str, Any], copy: int) -> Bool | None:
         """Which agents terminated `(N,)` if the episode is over (the others were truncated), or None if it goes on."""
+        for flags in (terminations, truncations):
+            for name, flag in flags.items():
+                if name not in self._flagged or not isinstance(flag, bool | np.bool_ | int | np.integer | None):
+                    legal = "True or False for each agent, and for '__all__'"
+                    raise self._error(copy, f"the termination or truncation of {name!r} is {flag!r}", legal)
         terminated, truncated = (
             np.array([bool(flags.get(agent)) for agent in self.agents]) for flags in (terminations, truncations)
         )

@@ -6,7 +6,7 @@ import logging
 import math
 import pickle
 import uuid
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -203,11 +203,11 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                     if num_timesteps is not None:
                         length = math.ceil(num_timesteps / self.num_envs)
                     parts = self._fragment(length, explore, random_actions)
+                samples = [self._joined(part) for part in parts]
+                self._callbacks.call("on_sample_end", samples=samples)
             except Exception as error:
                 self.error, self._needs_reset = error, True
                 raise
-            samples = [self._joined(part) for part in parts]
-            self._callbacks.call("on_sample_end", samples=samples)
         return samples
 
     def _joined(self, steps: list[_Step]) -> JointSample:
@@ -452,6 +452,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             state[COMPONENT_SAMPLING] = {
                 "in_evaluation": self.config.in_evaluation,
                 "num_envs": self.num_envs,
+                "options": self._options(),
                 "env": snapshot(self.env),
                 "acting": self.acting.get_state(),
                 "watched": None if self._watcher is None else self._watcher.get_state(),
@@ -475,15 +476,9 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         # RLlib hands the training runner's state to the evaluation runner, too; its episodes are not for it.
         if sampling is None or self.env is None or sampling["in_evaluation"] != self.config.in_evaluation:
             return
-        if sampling["env"] is None or sampling["num_envs"] != self.num_envs:
-            if log_once(f"new episodes of {self.config.env}"):
-                logger.warning(
-                    f"Environment {self.config.env} starts new episodes: it cannot be continued exactly where it was "
-                    f"saved (its copies do not come back from pickle as they were, or are others in number)."
-                )
-            # Not those that the run began with: episodes and noise would repeat themselves.
-            self._seed_anew(sampling["_steps_sampled"])
-            self._obs, self._needs_reset = None, True
+        same = sampling["num_envs"] == self.num_envs and sampling.get("options", self._options()) == self._options()
+        if sampling["env"] is None or not same:
+            self.begin_anew(sampling["_steps_sampled"])
             return
         self.env = pickle.loads(sampling["env"])
         self.acting.set_state(sampling["acting"])
@@ -491,6 +486,25 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             setattr(self, name, pickle.loads(pickle.dumps(sampling[name])))
         if self._watcher is not None:
             self._watcher.set_state(sampling.get("watched"))
+
+    def _options(self) -> Any:
+        """What environment the configuration asks for, to compare it with a saved one's."""
+        return _named([str(self.config.env), self.config.env_config or {}])
+
+    def begin_anew(self, after: int) -> None:
+        """Starts new episodes after a restore that cannot go on with the saved ones, and says so once.
+
+        Args:
+            after: Steps that had been sampled: environments and noise do not repeat what the run began with.
+        """
+        if log_once(f"new episodes of {self.config.env}"):
+            logger.warning(
+                f"Environment {self.config.env} starts new episodes after the restore: the saved ones cannot be "
+                f"continued exactly (they do not come back from pickle as they were, are others in number or options, "
+                f"or were those of a remote runner)."
+            )
+        self._seed_anew(after)
+        self._obs, self._needs_reset = None, True
 
     @override(Checkpointable)
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
@@ -504,3 +518,13 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
 
 _SAMPLING_STATE = ("_obs", "_needs_reset", "_episodes", "_steps_sampled", "_source")
+
+
+def _named(options: Any) -> Any:
+    """Options as plain values that are the same in every process: classes, functions and objects by their names."""
+    if isinstance(options, Mapping):
+        return {key: _named(value) for key, value in options.items()}
+    if isinstance(options, list | tuple):
+        return [_named(value) for value in options]
+    plain = options is None or isinstance(options, bool | int | float | str)
+    return options if plain else getattr(options, "__qualname__", type(options).__qualname__)
