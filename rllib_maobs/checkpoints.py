@@ -41,8 +41,15 @@ def module_folders(checkpoint: Path) -> dict[str, Path]:
 
 
 def saved_config(checkpoint: Path) -> Mapping[str, Any]:
-    """Return the settings of a checkpoint's algorithm, by name."""
-    stored: Any = pickle.loads((checkpoint / "class_and_ctor_args.pkl").read_bytes())
+    """Return the settings of a checkpoint's algorithm, by name.
+
+    Raises:
+        ValueError: If they are not there.
+    """
+    path = checkpoint / "class_and_ctor_args.pkl"
+    if not path.is_file():
+        raise ValueError(f"{str(checkpoint)!r} is no whole checkpoint of an RLlib algorithm: it has no {path.name}.")
+    stored: Any = pickle.loads(path.read_bytes())
     config: Mapping[str, Any] = stored["ctor_args_and_kwargs"][0][0]
     return config
 

@@ -115,8 +115,6 @@ def check_arguments(
     """Raise a ValueError for what is wrong on the command line."""
     if sizes and (both := {"num_agents", "num_predators"} & {*options}):
         raise ValueError(f"--num-agents and {both.pop()}=... say the same: give one of them")
-    if "scenario" in options:
-        raise ValueError("scenario=... is no option of a task: use --env")
     if len({path.absolute() for path in files}) < len(files):
         raise ValueError("two of --json, --csv, --per-episode and --record name the same file")
     if episodes < 2:

@@ -68,13 +68,15 @@ def parse_options(pairs: Sequence[str]) -> dict[str, Any]:
     """Turn `["gap=0.3", "physics=solid"]` into keywords; values are Python literals, or else strings.
 
     Raises:
-        ValueError: If an entry has no "=".
+        ValueError: If an entry has no "=", or names no option of a task.
     """
     options = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals:
             raise ValueError(f"{pair!r} is no option; write NAME=VALUE, such as horizon=50")
+        if name in ("scenario", "render_mode"):
+            raise ValueError(f"{name}=... is no option of a task; legal are those of its class, such as horizon=50")
         try:
             options[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError):

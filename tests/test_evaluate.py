@@ -116,7 +116,7 @@ def test_resized_tasks() -> None:
         (["agent_range=0.2", "--num-agents", 12], "use fewer or smaller bodies"),
         (["num_agents=4", "--num-agents", 3], "--num-agents and num_agents=... say the same"),
         (["--csv", "FOLDER.x", "--json", "FOLDER.x"], "name the same file"),
-        (["scenario=tunnel"], "is no option of a task: use --env"),
+        (["scenario=tunnel"], "scenario=... is no option of a task; legal are those of its class"),
         (["horzon=3"], "did you mean 'horizon'"),
         (["--env", "spread-4a"], "unknown scenario 'spread-4a'"),
         (["--env", "obstacle-predator-prey"], "was trained on (18,)"),
