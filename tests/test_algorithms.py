@@ -123,7 +123,8 @@ def test_without_a_saved_buffer_learning_waits_until_it_is_refilled(ray_session:
     restored = Algorithm.from_checkpoint(str(path))
     assert len(restored.replay_buffer) == 0
     restored.train()
-    assert restored._progress == {"env_steps": 80, "learning_starts": 56, "updates": 24}
+    progress = {"env_steps": 80, "learning_starts": 56, "updates": 24, "updates_per_env_step": 1.0}
+    assert restored._progress == progress
     algo.stop()
     restored.stop()
 

@@ -413,3 +413,39 @@ def test_what_cannot_be_continued_starts_a_new_episode(
     assert (going_on == again).all() == exact and (again != at_first).any()
     for one in (algo, *restored):
         one.stop()
+
+
+class Twice(Pair):
+    def __init__(self) -> None:
+        super().__init__()
+        self.possible_agents = ["a", "a"]
+
+
+class Growing(Pair):
+    def state(self) -> np.ndarray:
+        return np.zeros(2 + self.t, np.float32)
+
+
+class Wordy(Pair):
+    def state(self) -> Any:
+        return {"a": 1.0}
+
+
+class Still(Pair):
+    state = np.zeros(2)  # type: ignore[assignment]
+
+
+def test_teams_and_states_that_are_none_are_named() -> None:
+    with pytest.raises(ValueError, match=r"The agents of Twice are \['a', 'a'\]; legal are different names"):
+        StackedEnv([Twice()])
+    growing = StackedEnv([Growing()])
+    growing.reset(seed=0)
+    growing.state()
+    growing.step(np.zeros((1, 2, 2), np.float32))
+    with pytest.raises(ValueError, match=r"the state has 3 numbers in environment copy 0 at step 1 .*; legal: 2"):
+        growing.state()
+    for cls, message in ((Wordy, "the state is a dict"), (Still, r"state\(\) cannot be called")):
+        env = StackedEnv([cls()])
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=message):
+            env.state()

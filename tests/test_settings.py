@@ -414,3 +414,15 @@ def test_remote_runners_do_not_repeat_the_first_episodes_after_a_restore(ray_ses
     algo.restore_from_path(path)
     assert algo.env_runner_group.foreach_env_runner(first, local_env_runner=False) != fresh
     algo.stop()
+
+
+def test_a_checkpoint_of_other_networks_or_exploration_is_named(ray_session: None, tmp_path: Path) -> None:
+    algo = small_config("iddpg").build_algo()
+    path = algo.save_to_path(str(tmp_path))
+    algo.stop()
+    noise = {"type": "ornstein-uhlenbeck"}
+    for settings_, message in (({"twin_critics": True}, "RuntimeError"), ({"exploration": noise}, "KeyError")):
+        other = small_config("iddpg").training(**settings_).build_algo()
+        with pytest.raises(ValueError, match=f"was saved with other policies, networks.*{message}.*load_networks"):
+            other.restore_from_path(path)
+        other.stop()

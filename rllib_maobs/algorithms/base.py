@@ -248,7 +248,14 @@ class JointAlgorithm(AnyPath, Algorithm):
                 with files.open_input_stream(saved) as file:
                     team = pickle.load(file)["ctor_args_and_kwargs"][0][0].get("team")
                 self._follow(None if team is None else team.agents)
-        super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
+        try:
+            super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
+        except (KeyError, IndexError, RuntimeError) as error:  # what RLlib and torch say of what does not fit
+            raise ValueError(
+                f"{str(path)!r} was saved with other policies, networks, actions or exploration than those of this "
+                f"configuration ({type(error).__name__}: {str(error).splitlines()[0]}): restore it into the one that "
+                f"it was saved with, or start from its networks by maobs.load_networks."
+            ) from error
         self._send_weights()
 
     @override(Algorithm)

@@ -186,6 +186,11 @@ def map_policies(config: JointConfig) -> tuple[str, ...]:
     team = config.team
     default = type(config)()
     mapped = config.policy_mapping_fn is not default.policy_mapping_fn
+    if not mapped and (unnamed := [agent for agent in team.agents if not isinstance(agent, str)]):
+        raise ValueError(
+            f"Agents are called {unnamed}, and policies, which are called after them, must be strings: give "
+            f"config.multi_agent(policies={{'p0', ...}}, policy_mapping_fn=lambda agent, *a, **k: f'p{{agent}}')."
+        )
     if not config.is_multi_agent and not mapped:
         policies = {agent: PolicySpec() for agent in team.agents}
         config.multi_agent(policies=policies, policy_mapping_fn=own_policy)

@@ -369,7 +369,7 @@ def check_known(config: JointConfig) -> None:
     """
     defaults = vars(type(config)())
     for name in vars(config):
-        if name in defaults or name in _FILLED_IN:
+        if name in defaults or name in _FILLED_IN or name.startswith("__"):  # Tune's own begin so
             continue
         if callable(getattr(type(config), name, None)):
             raise ValueError(

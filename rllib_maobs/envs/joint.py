@@ -256,6 +256,10 @@ class StackedEnv:
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
                 f"with a fixed team."
             )
+        if len(set(self.agents)) < len(self.agents) or "__all__" in self.agents:
+            raise ValueError(
+                f"The agents of {self._name} are {self.agents}; legal are different names, none of them '__all__'."
+            )
         try:
             signature(env.reset).bind(seed=0)
         except TypeError as error:
@@ -269,6 +273,7 @@ class StackedEnv:
         self._envs = list(envs)
         self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._flagged = {*self.agents, "__all__"}
+        self._state_size = 0
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._listed = np.zeros(self.num_envs, dtype=np.bool_)  # which ones say in `agents` who is there
         self._obs: Float | None = None
@@ -439,14 +444,21 @@ class StackedEnv:
         rows: list[Float] = []
         for copy, env in enumerate(self._envs):
             try:
-                row = np.asarray(env.state(), dtype=np.float32).reshape(-1)
+                found = env.state()
             except (AttributeError, NotImplementedError) as error:
                 raise ValueError(
                     f"{self._name} has no state() of its own ({type(error).__name__}: {error}): use "
                     f'critic_state="observations", or define it in the environment.'
                 ) from error
-            if rows and row.size != rows[0].size:
-                raise self._error(copy, f"the state has {row.size} numbers", f"{rows[0].size}, as in copy 0")
+            except TypeError as error:
+                raise self._error(copy, f"state() cannot be called: {error}", "a method without arguments") from error
+            try:
+                row = np.asarray(found, dtype=np.float32).reshape(-1)
+            except (TypeError, ValueError) as error:
+                raise self._error(copy, f"the state is a {type(found).__name__}", "an array of numbers") from error
+            self._state_size = self._state_size or row.size
+            if row.size != self._state_size:
+                raise self._error(copy, f"the state has {row.size} numbers", f"{self._state_size}, as it had first")
             if not np.isfinite(row).all():
                 index = int(np.flatnonzero(~np.isfinite(row))[0])
                 raise self._error(copy, f"number {index} of the state is {row[index]}", "finite numbers")
