@@ -347,17 +347,17 @@ def check_values(config: JointConfig) -> None:
 
 
 def check_schedule(name: str, rate: Any) -> None:
-    """Raises a ValueError unless a learning rate that is a list is a schedule of RLlib's, of numbers above zero."""
+    """Raises a ValueError unless a learning rate that is a list is a schedule of RLlib's, of no numbers below zero."""
     if not isinstance(rate, list):
         return
     try:
-        legal = all(step >= 0 and math.isfinite(value) and value > 0 for step, value in rate) and rate[0][0] == 0
+        legal = all(step >= 0 and math.isfinite(value) and value >= 0 for step, value in rate) and rate[0][0] == 0
     except (TypeError, ValueError, IndexError):
         legal = False
     if not legal:
         raise ValueError(
             f"{name}={rate} is illegal; legal: a number > 0, or a schedule [[0, 1e-3], [100000, 1e-4], ...] of env "
-            f"steps and numbers > 0 that begins with step 0."
+            f"steps and numbers >= 0 that begins with step 0."
         )
 
 
