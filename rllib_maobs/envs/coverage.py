@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
 from rllib_maobs.envs.world import Bodies, FloatArray, World
@@ -17,8 +18,8 @@ TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
 
 
 @dataclass(frozen=True)
-class CoverageOptions(ScenarioOptions):
-    """Options of `Coverage`, documented in its subclasses."""
+class TargetOptions(ScenarioOptions):
+    """Options of tasks with one target for every agent, documented in these tasks."""
 
     num_agents: Annotated[int, Range(1)] = 3
     agent_radius: Annotated[float, Positive] = 0.15
@@ -29,6 +30,13 @@ class CoverageOptions(ScenarioOptions):
     obstacle_collision_penalty: Annotated[float, Range(0.0)] = 1.0
     accel: Annotated[float, Positive] = 5.0
     max_speed: Annotated[float, Positive] | None = 1.0
+
+
+@dataclass(frozen=True)
+class CoverageOptions(TargetOptions):
+    """Options of `Coverage`, documented in its subclasses."""
+
+    matching: Literal["nearest", "one_to_one"] = "nearest"
 
 
 OptionsT = TypeVar("OptionsT", bound=CoverageOptions)
@@ -89,9 +97,11 @@ class Coverage(Scenario[OptionsT]):
     def outcome(self, world: World) -> Outcome:
         """Return - sum over targets of the distance to the nearest agent - collisions, and the coverage."""
         o = self.options
-        nearest = world.distance[:, :, world.index["target"]].min(axis=1)  # (E, N)
+        distance = world.distance[:, : o.num_agents, world.index["target"]]  # (E, N, N)
+        nearest = distance.min(axis=1)  # (E, N)
         total = nearest.sum(axis=1)
-        rewards = -total[:, None] - o.agent_collision_penalty * world.contacts("agent")
+        paid = total if o.matching == "nearest" else matched(distance).sum(axis=1)
+        rewards = -paid[:, None] - o.agent_collision_penalty * world.contacts("agent")
         rewards -= o.obstacle_collision_penalty * world.contacts("obstacle")
         covered = nearest < o.goal_radius
         coverage, all_covered = covered.mean(axis=1), covered.all(axis=1)
@@ -103,6 +113,16 @@ class Coverage(Scenario[OptionsT]):
             "target_distance": total,
         }
         return Outcome(share_rewards(rewards, o.reward_mode), all_covered, metrics)
+
+
+def matched(distance: FloatArray) -> FloatArray:
+    """Return the (E, N) distances of the agents to the targets of the one-to-one assignment with the smallest sum.
+
+    Args:
+        distance: (E, N, N), of each agent to each target.
+    """
+    targets = np.array([linear_sum_assignment(cost)[1] for cost in distance], np.intp)
+    return np.take_along_axis(distance, targets[..., None], axis=2)[..., 0]
 
 
 def others(num_agents: int, num_bodies: int) -> NDArray[np.intp]:

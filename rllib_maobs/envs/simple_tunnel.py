@@ -12,14 +12,14 @@ from rllib_maobs.envs.coverage import TARGET_RADIUS, Positive, others, share_rew
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.scenario import Outcome, Scenario
 from rllib_maobs.envs.steering import take_turns, thrust
-from rllib_maobs.envs.tunnel import TunnelOptions, check_gap, column, gap_obstacles
+from rllib_maobs.envs.tunnel import GapOptions, check_gap, column, gap_obstacles
 from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World
 from rllib_maobs.layout import Entities, Layout, split
 from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
-class SimpleTunnelOptions(TunnelOptions):
+class SimpleTunnelOptions(GapOptions):
     """Options of `SimpleTunnel`, documented there."""
 
     reward_mode: Literal["sum", "mean", "individual"] = "individual"

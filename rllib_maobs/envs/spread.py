@@ -64,6 +64,9 @@ class Spread(Coverage[SpreadOptions]):
         goal_radius: How near an agent must be to cover a target. [MPE: 0.1]
         reward_mode: "sum" (MPE's collaborative reward), "mean" (the same, divided by N) or "individual"
             (r_i). [MPE: sum]
+        matching: Which distances the reward counts. "nearest": of every target to the nearest agent; "one_to_one": of
+            the assignment of one agent to each target with the smallest sum, so that an agent which is nearest to
+            no target has somewhere to go. Metrics stay the same. [MPE: nearest; one_to_one is for training]
         agent_collision_penalty: Price of one contact with an agent, for each of the two. [MPE: 1]
         obstacle_collision_penalty: Price of one contact with an obstacle. [our choice: 1]
         placement: "separated": agents and obstacles do not overlap, and every target leaves room for an agent

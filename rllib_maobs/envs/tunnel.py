@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.random import Generator
 
-from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive
+from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive, TargetOptions
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.steering import assign, take_turns, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
@@ -15,8 +15,8 @@ from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
-class TunnelOptions(CoverageOptions):
-    """Options of `Tunnel`, documented there."""
+class GapOptions(TargetOptions):
+    """Options of tasks with a gap between two obstacles, documented in these tasks."""
 
     agent_radius: Annotated[float, Positive] = 0.075
     obstacle_radius: Annotated[float, Positive] = 1.0
@@ -25,6 +25,11 @@ class TunnelOptions(CoverageOptions):
     target_distance: Annotated[float, Positive] = 1.0
     spacing: Annotated[float, Positive] = 0.3
     start_noise: Annotated[float, Range(0.0)] = 0.0
+
+
+@dataclass(frozen=True)
+class TunnelOptions(GapOptions, CoverageOptions):
+    """Options of `Tunnel`, documented there."""
 
 
 class Tunnel(Coverage[TunnelOptions]):
@@ -64,6 +69,9 @@ class Tunnel(Coverage[TunnelOptions]):
         goal_radius: How near an agent must be to cover a target. [MPE: 0.1]
         reward_mode: "sum" (MPE's collaborative reward), "mean" (the same, divided by N) or "individual" (r_i).
             [MPE: sum]
+        matching: Which distances the reward counts. "nearest": of every target to the nearest agent; "one_to_one": of
+            the assignment of one agent to each target with the smallest sum, so that an agent which is nearest to
+            no target has somewhere to go. Metrics stay the same. [MPE: nearest; one_to_one is for training]
         agent_collision_penalty: Price of one contact with an agent, for each of the two. [MPE: 1]
         obstacle_collision_penalty: Price of one contact with an obstacle. [our choice: 1]
         accel: Force at full action. [MPE: 5]
