@@ -66,6 +66,7 @@ ANOTHER = {
     "terminate_on_success": True,
     "state": "world",
     "reward_mode": "mean",
+    "matching": "one_to_one",
     "placement": "mpe",
     "prey": "flee",
     "num_agents": 4,

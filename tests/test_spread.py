@@ -1,10 +1,13 @@
 """Spread in hand-placed situations."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from mpe2 import simple_spread_v3
 
 from rllib_maobs.envs import make_vec
+from rllib_maobs.envs.coverage import matched
 from tests.episodes import episode_metrics, glide, place, roll, sample_actions
 
 
@@ -67,6 +70,21 @@ def test_spread_reward_modes(mode, expected):
     place(env, [[0.05, 0.0], [0.0, 1.0], [-0.24, 0.0], [0.4, 0.0], [0.6, 1.0]])
     _, rewards, _, _, _ = glide(env, [[-0.05, 0.0], [0.0, 0.0]])
     np.testing.assert_allclose(rewards[0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("matching", "expected"), [("nearest", -1.3), ("one_to_one", -2.1)])
+def test_spread_matching(matching, expected):
+    """Agent 0 is the nearest to both targets, 0.5 and 0.8 away; agent 1 is 1.6 from the second."""
+    env = spread_2(reward_mode="individual", matching=matching)
+    place(env, [[0.0, 0.0], [2.4, 0.0], [5.0, 5.0], [-0.5, 0.0], [0.8, 0.0]])
+    _, rewards, *_ = glide(env, [[0.0, 0.0], [0.0, 0.0]])
+    np.testing.assert_allclose(rewards[0], [expected, expected], rtol=1e-6)
+
+
+def test_matching_is_the_best_of_all_assignments():
+    distance = np.random.default_rng(0).uniform(size=(20, 4, 4))
+    best = [min(sum(d[i, j] for i, j in enumerate(order)) for order in permutations(range(4))) for d in distance]
+    np.testing.assert_allclose(matched(distance).sum(axis=1), best)
 
 
 def test_spread_agents_in_contact_both_pay():
