@@ -32,7 +32,7 @@ experiment = Experiment(
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.1),
             "env_config": {"action_mode": "force"},
-            # Scores are those of the task's own reward. By that, an agent that is nearest to no target has nowhere to go.
+            # Scores are those of the task's own reward. By that, an agent nearest to no target has nowhere to go.
             "train_env_config": {
                 "reward_mode": "mean",
                 "matching": "one_to_one",
