@@ -22,7 +22,7 @@ from typing import Any
 from rllib_maobs.envs import SCENARIOS
 from rllib_maobs.evaluate import Task, baselines_of, evaluated, jobs_of
 from rllib_maobs.experiment.report import SCORE
-from rllib_maobs.report.episodes import record_episode
+from rllib_maobs.report.episodes import best_and_median, record_episode
 from rllib_maobs.report.results import Section, read_results
 
 OUTPUT = "report.html"
@@ -52,12 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_output(output, force=args.force)
     except ValueError as error:
         parser.error(str(error))
-    episodes: dict[int, dict[str, dict[str, Any]]] = {}
-    for number, section in enumerate(sections):
+    from rllib_maobs.report.page import build_page  # needs bokeh
+
+    episodes = []
+    for section in sections:
         section.baselines = play_baselines(section)
-        episodes[number], missing = play_teams(section, args.seed)
+        played, missing = play_teams(section, args.seed)
+        episodes.append(played)
         notes += missing
-    from rllib_maobs.report.page import build_page  # an import of bokeh
 
     write_whole(output, build_page(sections, notes, episodes, machine()))
     for note in notes:
@@ -93,8 +95,10 @@ def write_whole(output: Path, text: str) -> None:
 def play_baselines(section: Section) -> dict[str, dict[str, float]]:
     """Return the means over episodes of what is not trained, by policy and measure; nothing on foreign tasks."""
     task = _task(section)
+    if task is None:
+        return {}
     means = {}
-    for policy in baselines_of(task) if task else []:
+    for policy in baselines_of(task):
         rows = evaluated(task, policy, _EPISODES, seed=0).drop(columns=["env", "agents", "options", "policy"])
         mean = {str(name): float(value) for name, value in rows.mean().items()}
         contacts = sum(value for name, value in mean.items() if name.startswith("collisions_"))
@@ -112,8 +116,6 @@ def play_teams(section: Section, seed: int) -> tuple[dict[str, dict[str, Any]], 
     Returns:
         Episodes by what they are called, and sentences about those that there are none of.
     """
-    from rllib_maobs.report.page import best_and_median
-
     task = _task(section)
     if task is None:
         return {}, [f"{section.name}: no episodes to watch, for it is not an environment of this package"]

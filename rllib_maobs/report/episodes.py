@@ -1,5 +1,6 @@
 """Episodes for the page's player: where everybody was at every step, and who touched whom."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,9 @@ import numpy as np
 from rllib_maobs.envs import VectorEnv, make_vec
 from rllib_maobs.envs.rendering import FRAMES_PER_SECOND
 from rllib_maobs.evaluate import Task
+from rllib_maobs.experiment.report import SCORE
 from rllib_maobs.policies import make_policy
+from rllib_maobs.report.results import Trial
 
 _DIGITS = 4  # of positions; the pictures are a few hundred pixels wide
 
@@ -24,7 +27,7 @@ def record_episode(task: Task, policy: str, seed: int = 0) -> dict[str, Any]:
         Plain values. `bodies`: `name`, `kind` (the group), `radius`, whether it `moves`, and `owner` of a target that
         belongs to an agent; `walls`: normal and offset of each; `view`: half of what the picture shows. For every step,
         the start included, `positions` [x, y, x, y, ...] of the bodies that move and the numbers of those in
-        `contact`; `fixed` the positions of the others; `metrics` of the episode, and `fps`, the speed of its time.
+        `contact`; `fixed` the positions of the others; `summary` says how it ended, and `fps` is the speed of its time.
     """
     env = make_vec(task.env, **task.options)
     player = make_policy(env, policy, seed)
@@ -53,9 +56,35 @@ def record_episode(task: Task, policy: str, seed: int = 0) -> dict[str, Any]:
         "fixed": _positions(env, moving=False),
         "positions": positions,
         "contact": contact,
-        "metrics": {name: float(values[0]) for name, values in info["episode_metrics"].items()},
+        "summary": _summary({name: float(values[0]) for name, values in info["episode_metrics"].items()}),
         "fps": FRAMES_PER_SECOND,
     }
+
+
+def best_and_median(trials: Sequence[Trial]) -> dict[str, Trial]:
+    """Return the teams of one algorithm that are worth watching, by what they are called.
+
+    Args:
+        trials: Of the algorithm.
+
+    Returns:
+        The best one by its score, and the one in the middle; of an even number, the worse of the two there.
+    """
+    order = sorted(trials, key=lambda trial: trial.result[SCORE])
+    best, median = order[-1], order[(len(order) - 1) // 2]
+    if best is median:
+        return {f"{best.label}, seed {best.settings['seed']}": best}
+    return {
+        f"{best.label}, best (seed {best.settings['seed']})": best,
+        f"{median.label}, median (seed {median.settings['seed']})": median,
+    }
+
+
+def _summary(metrics: Mapping[str, float]) -> str:
+    contacts = sum(value for name, value in metrics.items() if name.startswith("collisions_"))
+    share = f", {metrics['coverage']:.0%} covered" if "coverage" in metrics else ""
+    solved = f"solved at step {metrics['time_to_goal']:.0f}" if metrics["success"] else "not solved at the end"
+    return f"score {metrics['return_agent_0']:,.1f}{share}, {solved}, {contacts:.0f} contacts"
 
 
 def _positions(env: VectorEnv, *, moving: bool) -> list[float]:

@@ -4,7 +4,7 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
-// Charts. A line is named after its algorithm and tagged with its x-axis; a section's buttons say which are shown.
+// Charts. A line is named after its algorithm and its glyph tagged with its x-axis; buttons say which are shown.
 const figures = new Map();
 
 async function draw(element) {
@@ -34,7 +34,8 @@ function show(element) {
     [...section.querySelectorAll('[data-line][aria-pressed="false"]')].map((button) => button.dataset.line));
   const axis = section.querySelector(".axis input:checked")?.value;
   for (const line of figure.renderers) {
-    line.visible = !hidden.has(line.name) && (line.tags.length === 0 || line.tags.includes(axis));
+    const { tags } = line.glyph;
+    line.visible = !hidden.has(line.name) && (tags.length === 0 || tags.includes(axis));
   }
   const titles = figure.below[0].tags;
   if (titles.length) figure.below[0].axis_label = titles[axis === "time" ? 1 : 0];
@@ -67,10 +68,13 @@ class Player {
     [this.choice, this.canvas] = [root.querySelector("select"), root.querySelector("canvas")];
     [this.button, this.slider] = [root.querySelector(".play"), root.querySelector("input")];
     [this.strip, this.speed] = [root.querySelector(".strip"), root.querySelector(".speed")];
-    this.text = root.querySelector("output");
+    [this.text, this.summary] = [root.querySelector("output"), root.querySelector(".summary")];
     this.choice.addEventListener("change", () => this.open());
     this.button.addEventListener("click", () => (this.playing ? this.pause() : this.play()));
-    this.slider.addEventListener("input", () => { this.pause(); this.go(Number(this.slider.value)); });
+    this.slider.addEventListener("input", () => {
+      this.now = Number(this.slider.value);
+      this.pause();
+    });
     this.canvas.addEventListener("click", () => this.button.click());
     new ResizeObserver(() => this.render()).observe(this.canvas);
     dark.addEventListener("change", () => this.render());
@@ -85,6 +89,7 @@ class Player {
     const [halfWidth, halfHeight] = this.episode.view;
     this.canvas.style.aspectRatio = `${halfWidth} / ${halfHeight}`;
     this.canvas.setAttribute("aria-label", `${this.choice.selectedOptions[0].text}, drawn from above`);
+    this.summary.textContent = this.episode.summary;
     this.go(0);
   }
 

@@ -14,12 +14,12 @@ from rllib_maobs.experiment.report import LABELS, LAST, LAST_QUICK, load_curves
 # How an agent is moved and what critics see: the task is the same, and so are its scores.
 _NOT_THE_TASK = ("action_mode", "state")
 MEASURES = {
-    **{name: label for name, label in LABELS.items() if name != "all_covered"},  # the same as success
+    **{name: label for name, label in LABELS.items() if name not in ("all_covered", "collision_free")},
     "collisions": "contacts / episode",
-    "collision_free": "contact-free episodes",
-    "collisions_agents": "contacts with agents",
-    "collisions_obstacles": "contacts with obstacles",
-    "collisions_walls": "contacts with walls",
+    "collisions_agents": "with agents",
+    "collisions_obstacles": "with obstacles",
+    "collisions_walls": "with walls",
+    "collision_free": "contact-free",
     "time_to_goal": "steps to success",
     "path_efficiency": "path efficiency",
 }
