@@ -126,7 +126,8 @@ def play_teams(section: Section, seed: int) -> tuple[dict[str, dict[str, Any]], 
                 ((checkpoint, own),) = jobs_of(str(trial.folder), None, [], {})
                 episodes[name] = record_episode(own, checkpoint, seed)
             except (ValueError, OSError, EOFError, KeyError) as error:  # such as a checkpoint that is being written
-                reason = str(error).partition("; legal")[0] or type(error).__name__
+                # Without the path: the page is to be sent to others.
+                reason = str(error).partition("; legal")[0].replace(str(trial.folder), trial.folder.name)
                 missing.append(f"{section.name}: no episode of {name}: {reason}")
     for policy in section.baselines:
         episodes[f"{policy} (not trained)"] = record_episode(task, policy, seed)

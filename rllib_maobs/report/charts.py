@@ -97,7 +97,7 @@ def curve_chart(section: Section, measure: str, lines: Mapping[str, Line]) -> Ch
     plot.xaxis.formatter = NumeralTickFormatter(format="0,0.[00]")
     if measure in _SHARES:
         plot.yaxis.formatter = NumeralTickFormatter(format="0%")
-    return Chart(title, plot, ["", "env steps", title.lower()], rows)
+    return Chart(title, plot, ["team", "env steps", title.lower()], rows)
 
 
 def score_chart(title: str, runs: Mapping[str, Sequence[FloatArray]], lines: Mapping[str, Line]) -> Chart:
@@ -123,7 +123,7 @@ def score_chart(title: str, runs: Mapping[str, Sequence[FloatArray]], lines: Map
         source = {"x": [scaled(value)], "y": [label], "text": [rows[-1][1]]}
         dot = plot.scatter("x", "y", source=source, name=label, size=12, marker="diamond", color=line.color)
         plot.add_tools(HoverTool(renderers=[dot], visible=False, tooltips=[(label, "@text")]))
-    return Chart(title, plot, ["", title.lower()], rows)
+    return Chart(title, plot, ["team", title.lower()], rows)
 
 
 def profile_chart(what: str, runs: Mapping[str, Sequence[FloatArray]], lines: Mapping[str, Line]) -> Chart:
@@ -141,7 +141,7 @@ def profile_chart(what: str, runs: Mapping[str, Sequence[FloatArray]], lines: Ma
         rows += [[label, f"{thresholds[i]:,.2f}", f"{share.value[i]:.0%}"] for i in range(0, 101, 20)]
     plot.xaxis.axis_label, plot.yaxis.axis_label = what, "share of runs above"
     plot.yaxis.formatter = NumeralTickFormatter(format="0%")
-    return Chart("Performance profile", plot, ["", f"{what} above", "share of runs"], rows)
+    return Chart("Performance profile", plot, ["team", f"{what} above", "share of runs"], rows)
 
 
 def improvement_chart(runs: Mapping[str, Sequence[FloatArray]]) -> Chart | None:
@@ -159,7 +159,7 @@ def improvement_chart(runs: Mapping[str, Sequence[FloatArray]]) -> Chart | None:
         plot.scatter([value], [pair], size=12, marker="diamond", color=_COLORS[0])
     plot.xaxis.formatter = NumeralTickFormatter(format="0%")
     rows = [[pair, estimate_text("success", estimate)] for pair, estimate in pairs.items()]
-    return Chart("Probability of improvement", plot, ["", "probability"], rows)
+    return Chart("Probability of improvement", plot, ["pair", "probability"], rows)
 
 
 def number_text(measure: str, value: float) -> str:

@@ -162,7 +162,7 @@ def _results(section: Section) -> dict[str, Any]:
         rows.append(cells)
     for policy, means in section.baselines.items():
         rows.append([policy, "-", "-", *(number_text(measure, means.get(measure, np.nan)) for measure in measures)])
-    return {"columns": ["", "seeds", "env steps", *measures.values()], "rows": rows}
+    return {"columns": ["team", "seeds", "env steps", *measures.values()], "rows": rows}
 
 
 def _speed(section: Section) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _speed(section: Section) -> dict[str, Any]:
                 str(settings.get("num_env_runners", "-")),
             ]
         )
-    columns = ["", "env steps / s", "time per trial", "all trials", "environment copies", "remote EnvRunners"]
+    columns = ["team", "env steps / s", "time per trial", "all trials", "environment copies", "remote EnvRunners"]
     return {"columns": columns, "rows": rows}
 
 
@@ -196,8 +196,8 @@ def _settings(section: Section) -> dict[str, Any]:
         else:
             same.append([name, cells[0]])
     return {
-        "varied": {"columns": ["", *flat], "rows": varied},
-        "same": {"columns": ["", "value"], "rows": same},
+        "varied": {"columns": ["setting", *flat], "rows": varied},
+        "same": {"columns": ["setting", "value"], "rows": same},
     }
 
 
@@ -209,8 +209,10 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
             flat |= _flat(value, f"{prefix}{name}.")
         elif (prefix, name) != ("", "seed") and value not in ("", None):
             # Of a checkpoint to start from the last two folders: the page is to be sent to others.
-            text = "/".join(str(value).split("/")[-2:]) if name == "start_from" else json.dumps(value, default=str)
-            flat[prefix + name] = text.strip('"')
+            value = "/".join(str(value).split("/")[-2:]) if name == "start_from" else value
+            flat[prefix + name] = (
+                f"{value:g}" if isinstance(value, float) else json.dumps(value, default=str).strip('"')
+            )
     return flat
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from rllib_maobs.envs import SCENARIOS, make_scenario
-from rllib_maobs.experiment.report import LABELS, LAST, LAST_QUICK, load_curves
+from rllib_maobs.experiment.report import LABELS, LAST, LAST_QUICK, SCORE, load_curves
 
 # How an agent is moved and what critics see: the task is the same, and so are its scores.
 _NOT_THE_TASK = ("action_mode", "state")
@@ -149,37 +149,51 @@ def _read_folder(folder: Path) -> tuple[list[Trial], set[str]]:
     """Return the trials of a folder, and the names that its experiment planned."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {str(folder)!r}; give the results folder of an experiment")
+    experiment = folder / "experiment.json"
     try:
         curves = load_curves(folder)
     except (FileNotFoundError, KeyError, TypeError):
-        begun = any(folder.glob("*/params.json")) and (folder / "experiment.json").is_file()
-        wrong = "has no evaluation yet; try again later" if begun else "is no results folder"
+        if experiment.is_file():
+            raise ValueError(f"{str(folder)!r} has no evaluation yet: try again later") from None
         raise ValueError(
-            f"{str(folder)!r} {wrong}. Results folders are what the programs in tuned_examples/ write to; each trial "
-            f"in them has a folder with a result.json"
+            f"{str(folder)!r} is no results folder; legal: what a program in tuned_examples/ wrote to, with a folder "
+            f"for each trial that holds its result.json"
         ) from None
-    experiment = folder / "experiment.json"
     plan = json.loads(experiment.read_text()) if experiment.is_file() else {}
     planned = {f"{algorithm}-seed{seed}" for algorithm in plan.get("algos", []) for seed in plan.get("seeds", [])}
     trials = []
     for name, curve in curves.groupby("trial", sort=False):
-        if curve.dropna(axis=1, how="all").keys().intersection(MEASURES).empty:
-            continue
         path = folder / str(name)
-        last_line = path.joinpath("result.json").read_text().splitlines()
-        results = [json.loads(line) for line in (last_line[0], last_line[-1]) if line.endswith("}")]
+        curve = curve.dropna(subset=[SCORE]) if SCORE in curve else curve[:0]
+        if curve.empty:
+            continue
+        lines = path.joinpath("result.json").read_text().splitlines()
+        first, latest = _first_whole(lines), _first_whole(lines[::-1])
         trials.append(
             Trial(
                 folder=path,
                 label=str(curve["algorithm"].iloc[0]),
-                settings=results[0]["config"],
-                curve=curve.dropna(subset=curve.keys().intersection([*MEASURES]), how="all").reset_index(drop=True),
+                settings=first["config"],
+                curve=curve.reset_index(drop=True),
                 last=LAST_QUICK if plan.get("quick") else LAST,
-                failed=path.joinpath("error.txt").exists() and not results[-1].get("done"),
-                origin=_origin(path, results),
+                failed=path.joinpath("error.txt").exists() and not latest.get("done"),
+                origin=_origin(path, (first, latest)),
             )
         )
+    if not trials:
+        raise ValueError(f"{str(folder)!r} has no evaluation yet: try again later")
     return trials, planned
+
+
+def _first_whole(lines: Sequence[str]) -> dict[str, Any]:
+    """Return the first result among lines of JSON; that of a run that was killed while it wrote is not whole."""
+    for line in lines:
+        try:
+            result: dict[str, Any] = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        return result
+    return {}
 
 
 def _origin(trial: Path, results: Sequence[Mapping[str, Any]]) -> dict[str, str]:
@@ -205,9 +219,14 @@ def _tell_apart(trials: Sequence[Trial]) -> None:
     """Name the folder in the label where trials of one name come from several and are not one another's seeds."""
     for label in {trial.label for trial in trials}:
         alike = [trial for trial in trials if trial.label == label]
-        kinds = [json.dumps({**trial.settings, "seed": None}, sort_keys=True, default=str) for trial in alike]
+        kinds = [json.dumps(_without_seed(trial.settings), sort_keys=True, default=str) for trial in alike]
         seeds = [trial.settings["seed"] for trial in alike]
         folders = {trial.folder.parent for trial in alike}
         if len(folders) > 1 and (len({*kinds}) > 1 or len({*seeds}) < len(seeds)):
             for trial in alike:
                 trial.label = f"{label} ({trial.folder.parent.name})"
+
+
+def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what seeds of one training have in common: each may start from a seed of another one."""
+    return {**settings, "seed": None, "start_from": str(Path(settings.get("start_from") or "").parent)}
