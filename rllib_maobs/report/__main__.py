@@ -43,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--force", action="store_true", help="replace the file if there is one")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes to watch (default: 0)")
     args = parser.parse_args(arguments)
-    folders = list(dict.fromkeys(folder.expanduser().resolve() for folder in args.folders))
+    # Not resolved: the page calls results what the user calls them.
+    folders = list(dict.fromkeys(Path(os.path.abspath(folder.expanduser())) for folder in args.folders))
     try:
         if find_spec("bokeh") is None:
             raise ValueError('the report needs bokeh: pip install "rllib-maobs[report]"')

@@ -94,7 +94,7 @@ def curve_chart(section: Section, measure: str, lines: Mapping[str, Line]) -> Ch
             _line(plot, lines[policy], tag, x=[0.0, end], y=scaled(np.array([level, level])))
     rows += [[policy, "-", number_text(measure, level)] for policy, level in levels.items()]
     plot.xaxis.axis_label, plot.xaxis.tags = "env steps", ["env steps", "hours"]  # page.js puts the other one there
-    plot.xaxis.formatter = NumeralTickFormatter(format="0,0.[00]")
+    plot.xaxis.formatter = NumeralTickFormatter(format="0,0.[0000]")
     if measure in _SHARES:
         plot.yaxis.formatter = NumeralTickFormatter(format="0%")
     return Chart(title, plot, ["team", "env steps", title.lower()], rows)
@@ -110,7 +110,7 @@ def score_chart(title: str, runs: Mapping[str, Sequence[FloatArray]], lines: Map
     """
     estimates = {label: interquartile_mean(scores) for label, scores in runs.items()}
     plot = _figure(y_range=FactorRange(*reversed([*runs])), height=80 + 36 * len(runs))
-    plot.xaxis.formatter = NumeralTickFormatter(format="0,0.[00]")
+    plot.xaxis.formatter = NumeralTickFormatter(format="0,0.[0000]")
     scaled = _scaling(plot.xaxis, np.concatenate([scores for strata in runs.values() for scores in strata]))
     rows = []
     for label, (value, low, high) in estimates.items():

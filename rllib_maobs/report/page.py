@@ -125,7 +125,7 @@ def _overall(sections: Sequence[Section]) -> dict[str, Any] | None:
         "id": "all-tasks",
         "title": "All tasks",
         "text": f"Scores on {len(scores)} tasks, where 0 is random play and 1 the heuristic, of what was trained on "
-        f"all of them. The bootstrap draws the runs anew within each task.",
+        f"all of them. The bootstrap draws the runs anew within each task; there is no interval if one has a single run.",
         "lines": [line._asdict() for line in lines.values()],
         "charts": _placed("all-tasks-chart", charts),
     }
@@ -158,7 +158,7 @@ def _results(section: Section) -> dict[str, Any]:
         cells = [label, str(len(trials)), f"{min(trial.env_steps for trial in trials):,}"]
         for measure in measures:
             runs = np.array([trial.result.get(measure, np.nan) for trial in trials])
-            cells.append(estimate_text(measure, interquartile_mean([runs])))
+            cells.append(estimate_text(measure, interquartile_mean([runs])).replace(" (", "\n("))
         rows.append(cells)
     for policy, means in section.baselines.items():
         rows.append([policy, "-", "-", *(number_text(measure, means.get(measure, np.nan)) for measure in measures)])
