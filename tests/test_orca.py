@@ -66,10 +66,15 @@ def test_crowds_do_not_touch() -> None:
 
 
 def test_own_targets_and_walls() -> None:
-    env = maobs.make_vec("simple-tunnel", num_envs=1)
+    env = maobs.make_vec("simple-tunnel", action_mode="force")
     rows = play_episodes(env, make_policy(env, "orca"))
     assert rows[["collisions_agents", "collisions_obstacles", "collisions_walls"]].to_numpy().sum() == 0
     assert rows["success_agent_1"][0] == 1.0  # the one in the middle, with a free way
+    env.reset(seed=0)
+    position = env.world.position[0]
+    position[0], position[2] = position[7].copy(), position[5].copy()  # each at the other's target
+    actions = make_policy(env, "orca")(env.observe())[0]
+    assert actions[0, 1] > 0.1 and actions[2, 1] < -0.1
 
 
 def test_where_there_is_none(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

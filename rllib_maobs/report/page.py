@@ -125,7 +125,7 @@ def _overall(sections: Sequence[Section]) -> dict[str, Any] | None:
         "id": "all-tasks",
         "title": "All tasks",
         "text": f"Scores on {len(scores)} tasks, where 0 is random play and 1 the heuristic, of what was trained on "
-        f"all of them. The bootstrap draws the runs anew within each task; there is no interval if one has a single run.",
+        f"all of them. The bootstrap draws the runs anew within each task; where one has a single run there is none.",
         "lines": [line._asdict() for line in lines.values()],
         "charts": _placed("all-tasks-chart", charts),
     }
