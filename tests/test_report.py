@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from rllib_maobs.envs import make_vec
 from rllib_maobs.evaluate import Task
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 from rllib_maobs.policies import make_policy, play_episodes
-from rllib_maobs.report.__main__ import main, write_whole
+from rllib_maobs.report.__main__ import main, play_baselines, play_teams, write_whole
 from rllib_maobs.report.episodes import record_episode
 from rllib_maobs.report.results import read_results
 from rllib_maobs.report.statistics import (
@@ -167,6 +167,17 @@ def test_a_run_that_is_going_on(tmp_path: Path) -> None:
     (path / "error.txt").write_text("...")
     _, notes = read_results([tmp_path / "now"])
     assert notes == ["now/ours-seed0: failed after 2,000 env steps"]
+
+
+def test_environments_of_others_have_neither_baselines_nor_episodes(tmp_path: Path) -> None:
+    write_trial(tmp_path / "foreign", replace(spec("ours", 0), env="my_env"), [-3.0, -2.0, -1.0])
+    ((section,), notes) = read_results([tmp_path / "foreign"])
+    assert section.name == "my_env, horizon=12" and notes == []
+    assert play_baselines(section) == {}
+    assert play_teams(section, 0) == (
+        {},
+        ["my_env, horizon=12: no episodes to watch, for it is not an environment of this package"],
+    )
 
 
 def test_episodes_show_what_was_played() -> None:

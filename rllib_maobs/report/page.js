@@ -97,6 +97,7 @@ class Player {
     if (this.now >= this.end) this.go(0);
     this.playing = true;
     this.button.textContent = "Pause";
+    this.text.ariaLive = "off"; // screen readers need not say every step
     this.before = performance.now();
     requestAnimationFrame((time) => this.tick(time));
   }
@@ -104,6 +105,7 @@ class Player {
   pause() {
     this.playing = false;
     this.button.textContent = "Play";
+    this.text.ariaLive = "polite";
     if (this.episode) this.go(Math.round(this.now));
   }
 
