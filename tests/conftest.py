@@ -18,7 +18,7 @@ ALGORITHMS = sorted(maobs.ALGORITHMS)
 
 @pytest.fixture(scope="session")
 def ray_session() -> Iterator[None]:
-    """One small local Ray for the whole test session."""
+    """One small local Ray for all tests of a process."""
     ray.init(num_cpus=2, include_dashboard=False)
     yield
     ray.shutdown()
