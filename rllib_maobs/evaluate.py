@@ -6,8 +6,9 @@
 
 CHECKPOINT is the folder of an RLlib algorithm checkpoint (of this package, or of a stock algorithm trained on
 `MAObsEnv`), or of a trial, whose last checkpoint counts. Each plays without exploration in the environment and with the
-options that its training evaluated with, unless NAME=VALUE says otherwise, beside random play and the scenario's
-heuristic. Of every measure there is the mean over the episodes and a 95 % bootstrap interval of it.
+options that its training evaluated with, unless NAME=VALUE says otherwise, beside random play, the scenario's heuristic
+and, where each agent has a target, ORCA (`pip install "rllib-maobs[orca]"`). Of every measure there is the mean over
+the episodes and a 95 % bootstrap interval of it.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from scipy.stats import bootstrap
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
 from rllib_maobs.experiment.tables import format_table
 from rllib_maobs.play import parse_options, play
-from rllib_maobs.policies import make_policy, play_episodes, saved_options, trained_on
+from rllib_maobs.policies import BASELINES, make_policy, play_episodes, saved_options, trained_on
 
 # What the table shows, in its order, and how; a task reports those that make sense for it.
 LABELS = {
@@ -42,7 +43,6 @@ LABELS = {
 }
 _AT_ONCE = 100  # copies; more would be slower, for want of cache
 _PAIRS = 1_000_000  # of bodies, in all copies at once: some hundred megabytes
-BASELINES = ("random", "heuristic")
 
 
 class Task(NamedTuple):
@@ -93,8 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path, task in jobs:
         if task not in tasks:  # each task's baselines once, before what is to be held against them
             tasks.append(task)
-            rows += [_evaluated(task, name, args.episodes, args.seed) for name in BASELINES if _has(task, name)]
-        rows.append(_evaluated(task, path, args.episodes, args.seed).assign(policy=names[path]))
+            rows += [evaluated(task, name, args.episodes, args.seed) for name in baselines_of(task)]
+        rows.append(evaluated(task, path, args.episodes, args.seed).assign(policy=names[path]))
     episodes = pd.concat(rows, ignore_index=True)
     table = summarise_episodes(episodes)
     print(to_text(table))
@@ -208,8 +208,18 @@ def to_text(table: pd.DataFrame) -> str:
     return format_table(["task", "policy", *(LABELS[name][0] for name in measures)], cells)
 
 
-def _evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame:
-    """Play all episodes of one policy on one task, so many copies at once as are quick."""
+def evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame:
+    """Play all episodes of one policy on one task, so many copies at once as are quick.
+
+    Args:
+        task: The task.
+        policy: See `make_policy`.
+        episodes: How many.
+        seed: Of the first one; the next one adds 1.
+
+    Returns:
+        A row for each episode: its measures, and `env`, `agents`, `options`, `policy`.
+    """
     print(f"{task.env}, {task.num_agents} agents: {policy} ...", file=sys.stderr, flush=True)
     rows, done = [], 0
     bodies = sum(group.count for group in make_scenario(task.env, **task.options).bodies())
@@ -222,15 +232,21 @@ def _evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFram
     return pd.concat(rows, ignore_index=True).assign(**labels)
 
 
-def _has(task: Task, policy: str) -> bool:
-    """Return whether there is such a baseline."""
+def baselines_of(task: Task) -> list[str]:
+    """Return the baselines that a task has; says which one is left out because something is not installed."""
     env = make_vec(task.env, **task.options)
     env.reset(seed=0)
-    try:
-        make_policy(env, policy)(env.observe())
-    except NotImplementedError:
-        return False
-    return True
+    found = []
+    for name in BASELINES:
+        try:
+            make_policy(env, name)(env.observe())
+        except NotImplementedError:
+            continue
+        except ImportError as error:
+            print(f"left out: {error}", file=sys.stderr, flush=True)
+            continue
+        found.append(name)
+    return found
 
 
 def _short(paths: Sequence[str]) -> list[str]:

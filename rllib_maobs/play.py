@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("env", metavar="ENV", help=f"one of {', '.join(SCENARIOS)}")
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE", help="options of the environment")
-    parser.add_argument("--policy", default="random", help="random, heuristic or CHECKPOINT (default: random)")
+    parser.add_argument("--policy", default="random", help="random, heuristic, orca or CHECKPOINT (default: random)")
     parser.add_argument("--record", metavar="FILE", help="write a .gif or .mp4 instead of opening a window")
     parser.add_argument("--no-window", action="store_true", help="show nothing, print the metrics only")
     parser.add_argument("--episodes", type=int, default=1, help="how many (default: 1)")
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         env = parallel_env(args.env, render_mode=mode, **saved, **options)
         policy = make_policy(env.vector, args.policy, args.seed)
         recorder = Recorder(args.record) if args.record else None
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, NotImplementedError) as error:
         parser.error(str(error))
     metrics = play(env, policy, args.episodes, args.seed, recorder)
     if saved:

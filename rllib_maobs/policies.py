@@ -17,7 +17,10 @@ from rllib_maobs.checkpoints import find_checkpoint, module_folders, saved_confi
 from rllib_maobs.envs import SCENARIOS, VectorEnv
 from rllib_maobs.layout import Layout
 from rllib_maobs.options import closest
+from rllib_maobs.orca import OrcaPolicy
 
+# Policies that need no training, as the commands call them.
+BASELINES = ("random", "heuristic", "orca")
 # Actions `(E, N, A)` for observations `(E, N, O)`; discrete ones are numbers `(E, N)`.
 Policy = Callable[[NDArray[np.float32]], NDArray[Any]]
 
@@ -27,14 +30,19 @@ def make_policy(env: VectorEnv, name: str, seed: int = 0) -> Policy:
 
     Args:
         env: The environment.
-        name: "random", "heuristic", or the folder of an RLlib algorithm checkpoint, or of a trial.
-        seed: Of the random policy.
+        name: "random", "heuristic", "orca" (see `OrcaPolicy`), or the folder of an RLlib algorithm checkpoint, or of a
+            trial.
+        seed: Of the random policy, and of the random part of ORCA's.
 
     Raises:
         ValueError: If there is no such folder, or its modules do not fit the environment.
+        NotImplementedError: If there is no ORCA for the environment. Where it has no heuristic, playing it says so.
+        ImportError: If ORCA's library is not installed.
     """
     if name == "heuristic":
         return lambda observations: env.heuristic()
+    if name == "orca":
+        return OrcaPolicy(env, seed)
     if name != "random":
         return CheckpointPolicy(env, name)
     rng = np.random.default_rng(seed)
@@ -131,9 +139,8 @@ class CheckpointPolicy:
         try:
             folder = find_checkpoint(checkpoint)
         except ValueError as error:
-            known = ["random", "heuristic"]
             raise ValueError(
-                f"{error} Other policies are {' and '.join(known)}{closest(str(checkpoint), known)}."
+                f"{error} Other policies are {', '.join(BASELINES)}{closest(str(checkpoint), [*BASELINES])}."
             ) from None
         config, folders = saved_config(folder), module_folders(folder)
         module_of = {agent: str(config["policy_mapping_fn"](agent, None)) for agent in env.agents}

@@ -75,21 +75,21 @@ def test_a_trial_is_evaluated_as_its_training_was(trial_folder: Path, tmp_path: 
     ]
     run(trial_folder, "--episodes", 5, *flags)
     table = pd.read_csv(files[0])
-    assert list(table["policy"]) == ["random", "heuristic", "maddpg-seed0"]
+    assert list(table["policy"]) == ["random", "heuristic", "orca", "maddpg-seed0"]
     baselines = play_baselines("maobs/spread-3a", {"action_mode": "force", "horizon": 8}, episodes=5)
     assert table["return"][1] == pytest.approx(baselines["heuristic"]["return_agent_0"], rel=1e-6)
-    assert json.loads(files[1].read_text())[2]["return"] == pytest.approx(table["return"][2])
+    assert json.loads(files[1].read_text())[3]["return"] == pytest.approx(table["return"][3])
     episodes = pd.read_csv(files[2])
-    assert len(episodes) == 15
-    assert episodes.groupby("policy")["return"].mean()["maddpg-seed0"] == pytest.approx(table["return"][2])
+    assert len(episodes) == 20
+    assert episodes.groupby("policy")["return"].mean()["maddpg-seed0"] == pytest.approx(table["return"][3])
     assert files[3].stat().st_size > 1000
 
 
 def test_teams_of_other_sizes(trial_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(trial_folder, "--episodes", 2, "--num-agents", 2, 9, "--csv", tmp_path / "sizes.csv", "horizon=2")
     table = pd.read_csv(tmp_path / "sizes.csv")
-    assert list(table["agents"]) == [2, 2, 2, 9, 9, 9]
-    nine = json.loads(table["options"][5])
+    assert list(table["agents"]) == [2] * 4 + [9] * 4
+    nine = json.loads(table["options"][7])
     assert nine == asdict(make_scenario("spread-9a", action_mode="force", horizon=2).options)
     out = capsys.readouterr().out
     assert "spread-3a, 9 agents" in out
