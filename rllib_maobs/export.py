@@ -151,7 +151,7 @@ def _source(checkpoint: str | Path, agent: str | None, ending: str) -> tuple[dic
     description = Description(
         version=VERSION,
         package_version=__version__,
-        algorithm=_name(config.get("algo_class")),
+        algorithm=config["class"].name,
         env=env,
         env_options=plain,
         agent_id_input=numbered,
@@ -203,7 +203,10 @@ def _shapes(portable: PortableActor, counts: Mapping[str, Any]) -> dict[str, lis
 def _settings(module: AgentModule) -> dict[str, Any]:
     """What a safetensors file says of a module."""
     settings = {name: value for name, value in module.model_config.items() if name in SETTINGS}
-    return {"class": type(module).__name__, "model_config": settings | {"actor": ACTORS.reference(settings["actor"])}}
+    return {
+        "class": type(module).__name__,
+        "model_config": settings | {"actor": ACTORS.reference(settings.get("actor", "mlp"))},
+    }
 
 
 def _safetensors(source: Mapping[str, _Exported], description: Description) -> bytes:
@@ -242,8 +245,7 @@ def _onnx(source: Mapping[str, _Exported], description: Description) -> bytes:
                 PortableTeam(actors),
                 tuple(arrays),
                 dynamo=True,
-                # It takes 1e-12 for nothing, and a distance of 0 would become NaN.
-                optimize=False,
+                optimize=False,  # it takes 1e-12 for nothing, and a distance of 0 would become NaN
                 verbose=False,
                 external_data=False,
                 dynamic_shapes=(tuple(free),),
@@ -258,18 +260,27 @@ def _onnx(source: Mapping[str, _Exported], description: Description) -> bytes:
             f"export safetensors"
         ) from error
     assert program is not None
+    _tidy(program.model)
     model = program.model_proto
-    del model.metadata_props[:]
     entry = model.metadata_props.add()
     entry.key, entry.value = KEY, description.to_json()
-    for node in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output, model.graph):
-        del node.metadata_props[:]  # the tracer's notes: places of files on this machine
-    for function in model.functions:
-        for node in function.node:
-            del node.metadata_props[:]
+    # The tracer's notes name files of this machine.
+    for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output, model.graph):
+        del part.metadata_props[:]
     content: bytes = model.SerializeToString()
     _check(content, source, description)
     return content
+
+
+def _tidy(model: Any) -> None:
+    """Computes once what is constant, and drops what is not needed: ONNX Runtime warns of it otherwise."""
+    from onnx_ir.passes.common import InlinePass
+    from onnxscript.optimizer import fold_constants, remove_unused_functions, remove_unused_nodes
+
+    InlinePass()(model)
+    fold_constants(model)
+    remove_unused_nodes(model)
+    remove_unused_functions(model)
 
 
 def _check(content: bytes, source: Mapping[str, _Exported], description: Description) -> None:
@@ -325,7 +336,7 @@ def _batch(state: Mapping[str, torch.Tensor], size: int) -> dict[str, torch.Tens
 
 
 def _name(given: Any) -> str:
-    """A name for an environment or an algorithm: a text, or that of a class or function."""
+    """A name for an environment: a text, or that of a class or function."""
     return given if isinstance(given, str) else getattr(given, "__name__", type(given).__name__)
 
 
