@@ -187,7 +187,20 @@ def compared(path: Path, module: Any) -> None:
             assert all(space.contains(action.astype(space.dtype)) for action in got.reshape(-1, *space.shape))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("utility", "entity")])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_network_to_be_traced_acts_as_the_module(kind: str) -> None:
+    module = made(**KINDS[kind])
+    portable, layout = PortableActor(module), tuple(Entities(*g) for g in module.model_config["observation_layout"])
+    observations = np.random.default_rng(0).normal(size=(STEPS, 4, layout_size(layout))).astype(np.float32)
+    state, actions = [torch.zeros(4, *shape) for shape in portable.state.values()], []
+    for seen in torch.from_numpy(observations):
+        inputs = split(layout, seen).values() if portable.free else [seen]
+        action, *state = portable(*inputs, *state)
+        actions.append(action.numpy())
+    np.testing.assert_allclose(np.stack(actions), expected_actions(module, observations), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["mlp", "lstm", "entity-lstm", "discrete", "integers", "own"])  # tracing takes seconds
 def test_onnx_runtime_acts_as_the_module(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     module = made(**KINDS[kind])
     path = written(tmp_path / "agent.onnx", {"agent_0": module})
@@ -386,7 +399,7 @@ def test_a_trace_that_acts_otherwise_is_refused(files: dict[str, Path], checkpoi
 def test_a_file_says_what_it_was_trained_on(files: dict[str, Path]) -> None:
     said = describe(files["own.onnx"])
     assert (said.algorithm, said.env, said.env_options) == (
-        "MADDPGLSTM",
+        "maddpg-lstm",
         "spread-3a",
         {"num_agents": 2, "num_obstacles": 1},
     )
