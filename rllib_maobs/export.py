@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -238,6 +239,8 @@ def _onnx(source: Mapping[str, _Exported], description: Description) -> bytes:
             for shape in marked.values()
         ]
     described = description.actors.values()
+    # It warns of other packages that are not installed.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -312,6 +312,21 @@ def test_files_that_are_none_are_refused(ending: str, tmp_path: Path) -> None:
             describe(path)
 
 
+def test_an_onnx_file_reads_no_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret").write_bytes(np.zeros(4, np.float32).tobytes())
+    weights = onnx.TensorProto(name="w", data_type=1, dims=[4], data_location=onnx.TensorProto.EXTERNAL)
+    place = weights.external_data.add()
+    place.key, place.value = "location", "secret"
+    node, out = onnx.helper.make_node("Identity", ["w"], ["y"]), onnx.helper.make_tensor_value_info("y", 1, [4])
+    graph = onnx.helper.make_graph([node], "graph", [], [out], [weights])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
+    (tmp_path / "agent.onnx").write_bytes(model.SerializeToString())
+    onnxruntime.InferenceSession(tmp_path / "agent.onnx")  # as it would be read elsewhere
+    with pytest.raises(ValueError, match="is no ONNX file that can be read"):
+        describe(tmp_path / "agent.onnx")
+
+
 def test_one_agent_of_several_is_asked_for_by_name(tmp_path: Path) -> None:
     modules = {"a": made(seed=1, hidden_sizes=[4]), "b": made(seed=2, hidden_sizes=[4])}
     path = written(tmp_path / "team.safetensors", modules)
