@@ -191,7 +191,7 @@ def read_exported(
         if path.suffix.lower() == ".onnx":
             return description, {name: OnnxActor(content, description, name) for name in description.actors}
         return description, {name: _module(description, name, content, actor) for name in description.actors}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{str(path)!r} can't be read: {error}") from error
 
 
@@ -310,7 +310,7 @@ def _parsed(path: Path, metadata: Mapping[str, str]) -> Description:
             if not all(isinstance(name, str) for name in names) or not all(s is None or 0 <= int(s) for s in sizes):
                 raise ValueError("names must be texts, and shapes numbers")
             _ = actor.layout, actor.action_space  # whether they can be made
-    except (ValueError, TypeError, KeyError, AttributeError, AssertionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, AssertionError, RecursionError) as error:
         raise ValueError(f"what {str(path)!r} says of itself can't be understood: {error!r}") from error
     return description
 

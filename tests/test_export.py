@@ -288,6 +288,7 @@ ACTOR = ("actors", "agent_0")
         # What would take more memory than there is.
         (_set(*ACTOR, "module", "model_config", "hidden_sizes", value=[10**7, 10**7]), "weights of agent_0 are not"),
         (_set(*ACTOR, "module", "model_config", "hidden_sizes", value="many"), "can't be read"),
+        (_set(*ACTOR, "module", "model_config", "hidden_sizes", value=[-1]), "can't be read: Trying to create tensor"),
         (_set(*ACTOR, "module", "class", value="os.system"), "can't be read: 'os.system'"),
         (_set(*ACTOR, "module", value=None), "can't be read"),
     ],
