@@ -30,7 +30,7 @@ from ray.rllib.core.rl_module import RLModule
 
 from rllib_maobs.checkpoints import find_checkpoint, module_folders, saved_config
 from rllib_maobs.envs import SCENARIOS
-from rllib_maobs.exported import FORMATS, KEY, SETTINGS, VERSION, ActorDescription, Description, OnnxActor
+from rllib_maobs.exported import CLASSES, FORMATS, KEY, SETTINGS, VERSION, ActorDescription, Description, OnnxActor
 from rllib_maobs.layout import Layout, layout_size
 from rllib_maobs.modules import ACTORS, AgentModule
 from rllib_maobs.modules.portable import PortableActor, PortableTeam
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
     args = parser.parse_args(arguments)
     ending = f".{args.format}" if args.format else args.output.suffix.lower() if args.output else ".onnx"
-    path = args.output or Path(file_name(args.agent or "team") + ending)
+    path = args.output.expanduser() if args.output else Path(file_name(args.agent or "team") + ending)
     try:
         if path.suffix.lower() != ending:
             raise ValueError(f"--output {path} does not end in {ending}, as --format says")
@@ -204,10 +204,14 @@ def _shapes(portable: PortableActor, counts: Mapping[str, Any]) -> dict[str, lis
 def _settings(module: AgentModule) -> dict[str, Any]:
     """What a safetensors file says of a module."""
     settings = {name: value for name, value in module.model_config.items() if name in SETTINGS}
-    return {
-        "class": type(module).__name__,
-        "model_config": settings | {"actor": ACTORS.reference(settings.get("actor", "mlp"))},
-    }
+    if type(module) not in CLASSES.values():
+        raise ValueError(
+            f"{type(module).__name__} is a module of your own; safetensors take this package's: export onnx"
+        )
+    actor = ACTORS.reference(settings.get("actor", "mlp"))
+    # A class that can't be imported has a name, too: whoever loads the file gives the class.
+    settings["actor"] = actor if isinstance(actor, str) else f"{actor.__module__}:{actor.__qualname__}"
+    return {"class": type(module).__name__, "model_config": settings}
 
 
 def _safetensors(source: Mapping[str, _Exported], description: Description) -> bytes:

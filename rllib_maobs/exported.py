@@ -23,7 +23,7 @@ from rllib_maobs.modules import ACTORS, Actor, AgentModule, UtilityModule
 FORMATS = (".onnx", ".safetensors")
 KEY = "rllib_maobs"
 VERSION = 1
-_CLASSES = {"AgentModule": AgentModule, "UtilityModule": UtilityModule}
+CLASSES = {"AgentModule": AgentModule, "UtilityModule": UtilityModule}
 # What of a module's settings a file may set: acting needs no others, and no other is looked at.
 SETTINGS = (
     "actor",
@@ -332,7 +332,7 @@ def _module(
     size = layout_size(as_layout(settings["observation_layout"], None, "observation"))
 
     def make() -> AgentModule:
-        return _CLASSES[said["class"]](
+        return CLASSES[said["class"]](
             observation_space=gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
             action_space=actor.action_space,
             inference_only=True,

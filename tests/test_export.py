@@ -236,6 +236,22 @@ def test_safetensors_come_back_as_a_module(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(expected_actions(back, observations), expected_actions(module, observations))
 
 
+def test_classes_that_cannot_be_imported_are_given_and_modules_of_ones_own_refused(tmp_path: Path) -> None:
+    class Here(Sums):
+        pass
+
+    class Own(maobs.AgentModule):
+        pass
+
+    module = made(actor=Here)
+    path = written(tmp_path / "agent.safetensors", {"agent_0": module})
+    observations = np.random.default_rng(0).normal(size=(1, 4, 20)).astype(np.float32)
+    got = expected_actions(maobs.load_agent(path, actor=Here), observations)
+    np.testing.assert_array_equal(got, expected_actions(module, observations))
+    with pytest.raises(ValueError, match="Own is a module of your own; safetensors take this package's: export onnx"):
+        written(tmp_path / "own.safetensors", {"agent_0": made(cls=Own)})
+
+
 def edited(path: Path, change: Any) -> Path:
     """A safetensors file whose description was changed."""
     with safe_open(path, "pt") as file:
