@@ -46,7 +46,7 @@ def test_the_notebook_runs(run: Callable[..., dict[str, Any]]) -> None:
 
 def test_modules_go_elsewhere(run: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]) -> None:
     smaller = {
-        "MADDPG_ITERATIONS = 8 ": "MADDPG_ITERATIONS = 1 ",
+        "MADDPG_ITERATIONS = 24 ": "MADDPG_ITERATIONS = 1 ",
         "PPO_ITERATIONS = 4 ": "PPO_ITERATIONS = 1 ",
         "min_sample_timesteps_per_iteration=500": "min_sample_timesteps_per_iteration=40",
         "train_batch_size_per_learner=2000, minibatch_size=500, num_epochs=5": (
