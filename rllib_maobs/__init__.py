@@ -41,6 +41,7 @@ from rllib_maobs.envs import (
     register_scenario,
 )
 from rllib_maobs.envs.joint import register_envs
+from rllib_maobs.exported import load_agent
 from rllib_maobs.layout import Entities, Layout, layout_size, split
 from rllib_maobs.learner import JointLearner, TeamNetworks
 from rllib_maobs.modules import (
@@ -136,6 +137,7 @@ __all__ = [
     "VDNConfig",
     "VectorEnv",
     "layout_size",
+    "load_agent",
     "load_networks",
     "make_vec",
     "parallel_env",

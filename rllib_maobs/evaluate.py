@@ -5,10 +5,11 @@
     python -m rllib_maobs.evaluate results/spread-3a/maddpg-entity-seed0 --num-agents 3 6 9 12 20
 
 CHECKPOINT is the folder of an RLlib algorithm checkpoint (of this package, or of a stock algorithm trained on
-`MAObsEnv`), or of a trial, whose last checkpoint counts. Each plays without exploration in the environment and with the
-options that its training evaluated with, unless NAME=VALUE says otherwise, beside random play, the scenario's heuristic
-and, where each agent has a target, ORCA (`pip install "rllib-maobs[orca]"`). Of every measure there is the mean over
-the episodes and a 95 % bootstrap interval of it.
+`MAObsEnv`), or of a trial, whose last checkpoint counts, or a file of `rllib_maobs.export`. Each plays without
+exploration in the environment and with the options that its training evaluated with, unless NAME=VALUE says otherwise,
+beside random play, the scenario's heuristic and, where each agent has a target, ORCA
+(`pip install "rllib-maobs[orca]"`). Of every measure there is the mean over the episodes and a 95 % bootstrap interval
+of it.
 """
 
 import argparse
@@ -122,7 +123,7 @@ def check_arguments(
     if wrong := [size for size in sizes if size < 1]:
         raise ValueError(f"--num-agents {wrong[0]} is illegal; legal: integers >= 1")
     if not checkpoints:
-        raise ValueError("nothing to evaluate: give the folder of a checkpoint, or of a trial")
+        raise ValueError("nothing to evaluate: give the folder of a checkpoint, or of a trial, or an exported file")
     for path in files:
         if path.exists():
             raise ValueError(f"{path} exists: remove it, or choose another file")

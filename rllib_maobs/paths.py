@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path, PurePath
 from typing import Any, Self
 
@@ -42,3 +43,24 @@ class AnyPath(Checkpointable):
 def _local(path: Any, given: dict[str, Any]) -> Any:
     """With a filesystem a path is that filesystem's own."""
     return path if given.get("filesystem") else absolute(path)
+
+
+def file_name(name: str) -> str:
+    """A file's name made of one from outside, such as an agent's: it names no other folder, and no hidden file."""
+    return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[:100] or "_"
+
+
+def write_aside(path: Path, content: bytes) -> None:
+    """Writes a file aside and renames it: nothing half-written is ever there under its name.
+
+    Raises:
+        ValueError: If it can't be written, e.g. for want of space.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        aside.write_bytes(content)
+        aside.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path} can't be written: {error.strerror}") from error
+    finally:
+        aside.unlink(missing_ok=True)

@@ -6,9 +6,10 @@
 
 Without `--record` the episodes run in a window, in real time. At the end the mean metrics are printed. CHECKPOINT is
 the folder of an RLlib algorithm checkpoint (of this package, or of a stock algorithm trained on `MAObsEnv`), or of a
-trial, whose last checkpoint counts; its policies act without exploration. They play what they were evaluated on: the
-options in the checkpoint hold unless the command line says otherwise. Agents with entity networks that share a policy
-play teams of any size:
+trial, whose last checkpoint counts, or a file of `rllib_maobs.export`; its policies act without exploration. They play
+what they were evaluated on: the options in the checkpoint hold unless the command line says otherwise. Checkpoints are
+pickles: play those of people you trust only; files may come from anybody. Agents with entity networks that share a
+policy play teams of any size:
 
     python -m rllib_maobs.play spread-9a --policy CHECKPOINT-of-spread-3a
 """

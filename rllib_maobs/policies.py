@@ -1,8 +1,9 @@
 """Who plays: random and hand-written policies, and what was trained, as functions from observations to actions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from ray.rllib.utils.spaces.space_utils import unsquash_action
 
 from rllib_maobs.checkpoints import find_checkpoint, module_folders, saved_config
 from rllib_maobs.envs import SCENARIOS, VectorEnv
+from rllib_maobs.exported import OnnxActor, describe, is_exported, read_exported
 from rllib_maobs.layout import Layout
 from rllib_maobs.options import closest
 from rllib_maobs.orca import OrcaPolicy
@@ -30,8 +32,8 @@ def make_policy(env: VectorEnv, name: str, seed: int = 0) -> Policy:
 
     Args:
         env: The environment.
-        name: "random", "heuristic", "orca" (see `OrcaPolicy`), or the folder of an RLlib algorithm checkpoint, or of a
-            trial.
+        name: "random", "heuristic", "orca" (see `OrcaPolicy`), the folder of an RLlib algorithm checkpoint, or of a
+            trial, or an exported file.
         seed: Of the random policy, and of the random part of ORCA's.
 
     Raises:
@@ -85,7 +87,7 @@ def saved_options(policy: str, scenario_id: str) -> dict[str, Any]:
     """Return the environment options of a checkpoint, those of its evaluation where they differ from the training's.
 
     Args:
-        policy: Folder of an algorithm checkpoint or of a trial; anything else has no options.
+        policy: Folder of an algorithm checkpoint or of a trial, or an exported file; anything else has no options.
         scenario_id: What is to be played. If that is not what was trained, its own preset options come first, such as
             the number of agents of spread-9a.
     """
@@ -111,8 +113,11 @@ def trained_on(checkpoint: str) -> tuple[Any, dict[str, Any]]:
         The scenario's id or class, None if it is not one of this package; and the environment's options.
 
     Raises:
-        ValueError: If it is no checkpoint.
+        ValueError: If it is neither a checkpoint nor an exported file.
     """
+    if is_exported(checkpoint):
+        said = describe(checkpoint)
+        return (said.env if said.env in SCENARIOS else None), said.env_options
     config = saved_config(find_checkpoint(checkpoint))
     evaluation = config.get("evaluation_config") or {}
     options = {**(config.get("env_config") or {}), **(evaluation.get("env_config") or {})}
@@ -121,14 +126,14 @@ def trained_on(checkpoint: str) -> tuple[Any, dict[str, Any]]:
 
 
 class CheckpointPolicy:
-    """Acts like the modules of an RLlib checkpoint, without exploration.
+    """Acts like the modules of an RLlib checkpoint, or of an exported file, without exploration.
 
     Modules with entity networks act in teams of another size than they were trained in, too.
 
     Args:
         env: The environment.
-        checkpoint: Folder of an algorithm checkpoint, or of a trial, whose last one counts. Its policy mapping says
-            which module acts for which agent.
+        checkpoint: Folder of an algorithm checkpoint, or of a trial, whose last one counts, or an exported file. Its
+            policy mapping says which module acts for which agent.
 
     Raises:
         ValueError: If it holds none for an agent, or observations or actions have another size than those of the
@@ -136,25 +141,19 @@ class CheckpointPolicy:
     """
 
     def __init__(self, env: VectorEnv, checkpoint: str | Path) -> None:
-        try:
-            folder = find_checkpoint(checkpoint)
-        except ValueError as error:
-            raise ValueError(
-                f"{error} Other policies are {', '.join(BASELINES)}{closest(str(checkpoint), [*BASELINES])}."
-            ) from None
-        config, folders = saved_config(folder), module_folders(folder)
-        module_of = {agent: str(config["policy_mapping_fn"](agent, None)) for agent in env.agents}
+        trained = _exported(checkpoint) if is_exported(checkpoint) else _checkpoint(checkpoint)
+        module_of = {agent: trained.module_of(agent) for agent in env.agents}
         for agent, module_id in module_of.items():
-            if module_id not in folders:
-                raise ValueError(f"checkpoint {folder} has no module for {agent}; it has {', '.join(folders)}")
-        modules = {mid: RLModule.from_checkpoint(folders[mid]) for mid in sorted(set(module_of.values()))}
+            if module_id not in trained.modules:
+                raise ValueError(f"{trained.name} has no module for {agent}; it has {', '.join(trained.modules)}")
+        modules = {mid: trained.modules[mid]() for mid in sorted(set(module_of.values()))}
         # What observations begin with: the agent's number as a one-hot vector if it was trained so, else nothing.
-        size = len(env.agents) if config.get("agent_id_input", False) else 0
+        size = len(env.agents) if trained.agent_ids else 0
         self._ids = np.eye(len(env.agents), size, dtype=np.float32)
         # Agents of one module that see the same act together.
         agents = dict[tuple[str, Layout], list[int]]()
         for index, (agent, module_id) in enumerate(module_of.items()):
-            _check_actions(env, agent, modules[module_id].action_space, config)
+            _check_actions(env, agent, modules[module_id].action_space, trained.options)
             agents.setdefault((module_id, env.observation_layouts[agent]), []).append(index)
         self._groups = [
             (_fitting(env, env.agents[columns[0]], modules[module_id], size), columns)
@@ -181,6 +180,9 @@ class CheckpointPolicy:
 
     def _act(self, number: int, module: Any, seen: NDArray[np.float32]) -> NDArray[Any]:
         """Return one group's actions `(B, A)` for what its agents see, `(B, O)`."""
+        if isinstance(module, OnnxActor):
+            actions, self._states[number] = module.act(seen, self._states.get(number))
+            return actions
         batch: dict[str, Any] = {Columns.OBS: torch.from_numpy(seen)}
         if module.is_stateful():
             if number not in self._states:
@@ -200,12 +202,53 @@ class CheckpointPolicy:
         return np.asarray(unsquash_action(flat, self._space)) if self._space.shape else flat
 
 
-def _check_actions(env: VectorEnv, agent: str, trained: Any, config: Any) -> None:
+class _Trained(NamedTuple):
+    """What was trained, wherever it lies: `modules` makes each one when it is asked for."""
+
+    name: str
+    modules: Mapping[str, Callable[[], Any]]
+    module_of: Callable[[str], str]
+    agent_ids: bool
+    options: Mapping[str, Any]
+
+
+def _checkpoint(path: str | Path) -> _Trained:
+    """The modules of a checkpoint."""
+    try:
+        folder = find_checkpoint(path)
+    except ValueError as error:
+        raise ValueError(
+            f"{error} Other policies are {', '.join(BASELINES)}{closest(str(path), [*BASELINES])}."
+        ) from None
+    config = saved_config(folder)
+    return _Trained(
+        name=f"checkpoint {folder}",
+        modules={mid: partial(RLModule.from_checkpoint, place) for mid, place in module_folders(folder).items()},
+        module_of=lambda agent: str(config["policy_mapping_fn"](agent, None)),
+        agent_ids=config.get("agent_id_input", False),
+        options=config.get("env_config") or {},
+    )
+
+
+def _exported(path: str | Path) -> _Trained:
+    """The actors of an exported file."""
+    said, actors = read_exported(path)
+    return _Trained(
+        name=f"file {path}",
+        modules={name: partial(actors.__getitem__, name) for name in actors},
+        module_of=said.actor_of,
+        # Actors of ONNX files have their numbers inside.
+        agent_ids=said.agent_id_input and Path(path).suffix.lower() != ".onnx",
+        options=said.env_options,
+    )
+
+
+def _check_actions(env: VectorEnv, agent: str, trained: Any, options: Mapping[str, Any]) -> None:
     """Raise a ValueError if an agent was trained with other actions than those of the environment."""
     here = env.action_spaces[agent]
     if (here.shape, getattr(here, "n", None)) == (trained.shape, getattr(trained, "n", None)):
         return
-    mode = (config.get("env_config") or {}).get("action_mode", "mpe")
+    mode = options.get("action_mode", "mpe")
     raise ValueError(
         f"{agent} has actions {_size(here)} in {env.scenario}, but was trained with {_size(trained)}: give the "
         f"environment the options of the training, such as action_mode={mode}"

@@ -34,8 +34,23 @@ SMALLER = {
         '("iddpg", "maddpg", "maddpg-often")': '("maddpg-often",)',
         "num_envs=100": "num_envs=4",
     },
+    "elsewhere": {
+        "MADDPG_ITERATIONS = 24 ": "MADDPG_ITERATIONS = 1 ",
+        "PPO_ITERATIONS = 4 ": "PPO_ITERATIONS = 1 ",
+        "min_sample_timesteps_per_iteration=500": "min_sample_timesteps_per_iteration=40",
+        "train_batch_size_per_learner=2000, minibatch_size=500, num_epochs=5": (
+            "train_batch_size_per_learner=400, minibatch_size=200, num_epochs=1"
+        ),
+        "num_envs=20": "num_envs=2",
+    },
 }
-LEFT = {"quickstart": ["curves", "modules"], "environments": ["result"], "networks": ["both"], "experiment": ["best"]}
+LEFT = {
+    "quickstart": ["curves", "modules"],
+    "environments": ["result"],
+    "networks": ["both"],
+    "experiment": ["best"],
+    "elsewhere": ["returns"],
+}
 
 
 def test_every_notebook_is_here() -> None:

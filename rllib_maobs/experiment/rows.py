@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import rllib_maobs as maobs
 from rllib_maobs.envs import SCENARIOS, make_scenario
 from rllib_maobs.options import Range, check_value, closest
+from rllib_maobs.paths import file_name
 
 PAPER_HORIZON = 100
 _Count = Annotated[int, Range(1)]
@@ -93,6 +94,10 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If one is unknown or illegal; names the legal ones.
     """
+    if name != file_name(name):
+        raise ValueError(
+            f"Row {name!r}: folders of trials are named after it; legal are letters, digits and . _ + - (no dot first)."
+        )
     algorithm = row.get("algorithm", "")
     if algorithm not in maobs.ALGORITHMS:
         legal = ", ".join(maobs.ALGORITHMS)

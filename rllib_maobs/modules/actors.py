@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -41,10 +41,16 @@ class Actor(nn.Module, ABC):
     setting. Its type hint is checked, and one named `hidden_sizes`, `activation` or `cell_size` is set by RLlib's
     `model_config`, too.
 
+    Attributes:
+        takes_groups: Whether an observation may also be given as its groups by name, with any number of entities in
+            each: `{"target": (..., count, size), ...}`. Such an actor is exported for any number of them.
+
     Args:
         layout: What the agent's observation is made of.
         num_outputs: A, length of the agent's action, or the number of its discrete actions.
     """
+
+    takes_groups: ClassVar[bool] = False
 
     def __init__(self, layout: Layout, num_outputs: int) -> None:
         super().__init__()

@@ -10,7 +10,7 @@ of h over the senders, weighted in each channel by a softmax of a linear map of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar
 
 import torch
@@ -139,9 +139,18 @@ class Ego(nn.Module):
         )
         self.size = own + edge * len(self.around)
 
-    def forward(self, observation: Tensor, extra: Tensor | None = None) -> Tensor:
-        """The agent's own numbers, and what it hears of each group: `(..., size)`."""
-        groups = split(self.layout, observation)
+    def forward(self, observation: Tensor | Mapping[str, Tensor], extra: Tensor | None = None) -> Tensor:
+        """The agent's own numbers, and what it hears of each group: `(..., size)`.
+
+        Args:
+            observation: `(..., O)`, or its groups `(..., count, size)` by name, of which there may be any number.
+            extra: Further numbers of the agent's own.
+        """
+        absent: dict[str, Tensor] = {}
+        if isinstance(observation, Mapping):
+            groups, absent = self._never_empty(observation)
+        else:
+            groups = split(self.layout, observation)
         own = torch.cat([groups[name].flatten(-2).clamp(-_CLAMP, _CLAMP) for name in self.own], dim=-1)
         own = own if extra is None else torch.cat([own, extra], dim=-1)
         offsets = {name: groups[name][..., : self.position[name]] for name in self.around}
@@ -152,14 +161,28 @@ class Ego(nn.Module):
             if name in self.listeners:
                 told = [
                     self.heard[_key(name, mate.name)](
-                        offsets[mate.name].unsqueeze(-3) - offsets[name].unsqueeze(-2), rest[mate.name], rest[name]
+                        offsets[mate.name].unsqueeze(-3) - offsets[name].unsqueeze(-2),
+                        rest[mate.name],
+                        rest[name],
+                        absent.get(mate.name),
                     )
                     for mate in self.mates
                 ]
                 sender = torch.cat([sender, *told], dim=-1)
-            heard = self.edges[_key(name)](offsets[name].unsqueeze(-3), sender, own.unsqueeze(-2))
+            heard = self.edges[_key(name)](offsets[name].unsqueeze(-3), sender, own.unsqueeze(-2), absent.get(name))
             messages.append(heard.squeeze(-2))
         return torch.cat(messages, dim=-1)
+
+    def _never_empty(self, groups: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Groups with one entity more, which is absent `(..., 1, count + 1)`: ONNX Runtime fails at empty arrays."""
+        full, absent = dict(groups), {}
+        for name in self.around:
+            group = groups[name]
+            ghost = group.new_zeros(*group.shape[:-2], 1, group.shape[-1])
+            full[name] = torch.cat([group, ghost], dim=-2)
+            present = torch.zeros_like(group[..., 0])
+            absent[name] = torch.cat([present, ghost[..., 0] + 1.0], dim=-1).unsqueeze(-2)
+        return full, absent
 
 
 class World(nn.Module):
@@ -266,6 +289,8 @@ class EntityActor(Actor):
         deaf: Names of the groups that do not hear the agents.
     """
 
+    takes_groups: ClassVar[bool] = True
+
     def __init__(
         self,
         layout: Layout,
@@ -296,6 +321,8 @@ class EntityLSTMActor(LSTMActor):
         agents: Names of the groups that are agents.
         deaf: Names of the groups that do not hear the agents.
     """
+
+    takes_groups: ClassVar[bool] = True
 
     def __init__(
         self,
