@@ -164,8 +164,8 @@ class JointReplayBuffer(Checkpointable):
         row = 16 + sum(math.prod(shape) * (1 if name == "terminated" else 4) for name, shape in shapes.items())
         if capacity * row > (memory := memory_of(device)):
             raise ValueError(
-                f"A replay buffer of {capacity} rows takes {capacity * row / 1e9:.3g} GB, {row} bytes for each joint "
-                f"step, and there are {memory / 1e9:.3g} GB: legal is a capacity up to {int(memory // row)}."
+                f"A replay buffer of {capacity} rows takes {capacity * row / 1e9:,.1f} GB, {row} bytes for each joint "
+                f"step, and there are {memory / 1e9:,.1f} GB: legal is a capacity up to {int(memory // row)}."
             )
         # Empty memory is not touched, so it costs nothing until rows are written to it.
         self._columns = {

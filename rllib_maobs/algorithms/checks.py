@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shlex
 import shutil
@@ -11,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core import ALL_MODULES
 from ray.rllib.core.rl_module import RLModule, validate_module_id
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.policy.policy import PolicySpec
+from ray.rllib.utils import force_list
 
 from rllib_maobs.algorithms import settings
 from rllib_maobs.envs.team import Team, shares_reward
@@ -40,6 +43,19 @@ def one_of(name: str, value: Any, legal: Collection[str]) -> None:
     """Raises a ValueError that names the legal values unless the value is one of them."""
     if value not in legal:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}, not {value!r}.")
+
+
+def check_call(name: str, function: Any, *arguments: Any) -> None:
+    """Raises a ValueError unless a function takes such arguments."""
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        given = ", ".join(type(argument).__name__ for argument in arguments)
+        raise ValueError(
+            f"{name} can't be called as RLlib does, with {len(arguments)} arguments ({given}): {error}."
+        ) from None
+    except ValueError:  # it has no signature
+        pass
 
 
 def own_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
@@ -75,6 +91,14 @@ def check_settings_of(config: JointConfig) -> None:
         raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {config.env_runner_cls}: replay is joint.")
     if not issubclass(config.learner_class, JointLearner):
         raise ValueError(f"learner_class must be a JointLearner, not {config.learner_class}: its losses are joint.")
+    for callback in force_list(config.callbacks_class):
+        if not callable(callback) or (isinstance(callback, type) and not issubclass(callback, RLlibCallback)):
+            raise ValueError(
+                f"callbacks_class must be a subclass of RLlibCallback, or a list of them, not {callback!r}."
+            )
+    for name in settings.CALLBACKS:
+        if wrong := [function for function in force_list(getattr(config, name)) if not callable(function)]:
+            raise ValueError(f"{name} must be a function, or a list of functions, not {wrong[0]!r}.")
     settings.check_known(config)
     if not config.in_evaluation:
         settings.check_evaluation(config)
@@ -213,7 +237,10 @@ def map_policies(config: JointConfig) -> tuple[str, ...]:
                 f"policies may differ in exploration, by multi_agent(algorithm_config_overrides_per_module=...), and "
                 f"in networks, by rl_module(rl_module_spec=...)."
             )
+    check_call("policy_mapping_fn", config.policy_mapping_fn, team.agents[0], None)
     module_ids = tuple(config.policy_mapping_fn(agent, None) for agent in team.agents)
+    if unnamed := [mid for mid in module_ids if not isinstance(mid, str)]:
+        raise ValueError(f"policy_mapping_fn must return names of policies (strings), not {unnamed[0]!r}.")
     mapping = dict(zip(team.agents, module_ids, strict=True))
     if set(module_ids) != set(config.policies):
         raise ValueError(
@@ -310,7 +337,7 @@ def check_machine(config: JointConfig) -> None:
     size = 8 * observations * len(team.agents) * team.observation_size  # now and next, in single precision
     if size > (memory := memory_of("cuda" if config.num_gpus_per_learner > 0 else "cpu")):
         raise ValueError(
-            f"A minibatch takes {size / 1e9:.3g} GB, and there are {memory / 1e9:.3g} GB: lower "
+            f"A minibatch takes {size / 1e9:,.1f} GB, and there are {memory / 1e9:,.1f} GB: lower "
             f"train_batch_size_per_learner ({config.train_batch_size_per_learner}) or seq_length "
             f"({config.seq_length}, with recurrent actors)."
         )

@@ -235,6 +235,12 @@ class JointConfig(AlgorithmConfig):
                 setattr(self, name, value)
         return self
 
+    @override(AlgorithmConfig)
+    def update_from_dict(self, config_dict: dict[str, Any]) -> Self:
+        """Changes settings, e.g. by Tune's `param_space`, whichever of their names in RLlib they are given by."""
+        super().update_from_dict(settings.as_attributes(config_dict))
+        return self
+
     # RLlib's methods that calculate with what they are given.
     environment = _checked(AlgorithmConfig.environment)
     env_runners = _checked(AlgorithmConfig.env_runners)

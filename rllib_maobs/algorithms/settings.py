@@ -23,12 +23,15 @@ NonNegativeInt = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0.0, exclusive=True)]
 NonNegative = Annotated[float, Range(0.0)]
 
-_CALLBACKS = (
-    "callbacks_on_algorithm_init callbacks_on_train_result callbacks_on_evaluate_start callbacks_on_evaluate_end "
-    "callbacks_on_env_runners_recreated callbacks_on_checkpoint_loaded callbacks_on_environment_created "
-    "callbacks_on_episode_created callbacks_on_episode_start callbacks_on_episode_step callbacks_on_episode_end "
-    "callbacks_on_sample_end"
+CALLBACKS = tuple(
+    f"callbacks_{name}"
+    for name in (
+        "on_algorithm_init on_train_result on_evaluate_start on_evaluate_end on_env_runners_recreated "
+        "on_checkpoint_loaded on_environment_created on_episode_created on_episode_start on_episode_step "
+        "on_episode_end on_sample_end"
+    ).split()
 )
+"""Settings that are functions to be called."""
 
 LEGAL: dict[str, Any] = {
     # Ours.
@@ -83,8 +86,8 @@ LEGAL: dict[str, Any] = {
     "train_batch_size_per_learner": PositiveInt,
     "grad_clip": Positive | None,
     "grad_clip_by": Literal["global_norm", "norm", "value"],
-    "callbacks_class": type | list | tuple,
-    **dict.fromkeys(_CALLBACKS.split(), Callable | list | tuple | None),
+    "callbacks_class": Callable | list | tuple,
+    **dict.fromkeys(CALLBACKS, Callable | list | tuple | None),
     "evaluation_interval": NonNegativeInt | None,
     "evaluation_duration": PositiveInt | Literal["auto"],
     "evaluation_duration_unit": Literal["episodes", "timesteps"],
@@ -366,6 +369,12 @@ def attribute_of(name: str) -> str:
     return f"callbacks_{name}" if name.startswith("on_") else _ATTRIBUTES.get(name, name)
 
 
+def as_attributes(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by the names of RLlib's attributes, where they are given by those of its arguments."""
+    known = {*HONOURED, *HARMLESS, *REFUSED}
+    return {attribute_of(name) if name in known else name: value for name, value in given.items()}
+
+
 def settings_of_method(method: str) -> list[str]:
     """The settings that one of RLlib's methods takes, but for those that RLlib itself has deprecated."""
     parameters = inspect.signature(getattr(AlgorithmConfig, method)).parameters
@@ -505,7 +514,7 @@ def check_evaluation(config: JointConfig) -> None:
     check_values(evaluation)
     check_known(evaluation)
     legal = {attribute_of(name) for name in (*IN_EVALUATION, *HARMLESS)}
-    for name, value in (config.evaluation_config or {}).items():
+    for name, value in as_attributes(config.evaluation_config or {}).items():
         if name not in legal and not same(value, getattr(config, name, None)):
             setting = name.removeprefix("callbacks_")
             instead = _NOT_IN_EVALUATION.get(setting, "evaluation has its runners' settings alone for itself")
