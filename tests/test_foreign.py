@@ -118,6 +118,10 @@ class NoState(Pair):
         (lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": True}, *rest)), r"the reward of agent 'b' is True in"),
         (lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": np.bool_(0)}, *rest)), r"reward of agent 'b' is .*False"),
         (
+            lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": [1, [2]]}, *rest)),
+            r"reward of agent 'b' is \[1, \[2\]\]",
+        ),
+        (
             lambda: Pair(lambda env, o, r, *rest: (o, r | {"c": 1.0}, *rest)),
             r"there are rewards of \['c'\] in .*; legal",
         ),
@@ -181,6 +185,7 @@ def test_copies_have_the_same_spaces() -> None:
     ("flags", "message"),
     [
         ({"a": "False", "b": False}, "the termination or truncation of 'a' is 'False' in environment copy 0 at step 1"),
+        ({"a": 7, "b": False}, "the termination or truncation of 'a' is 7"),
         ({"a": False, "b": False, "__ALL__": False}, "the termination or truncation of '__ALL__' is False"),
     ],
 )
@@ -487,6 +492,31 @@ class Wordy(Pair):
 
 class Still(Pair):
     state = np.zeros(2)  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"observation_space": None},
+            r"has no observation_space for each of \['a', 'b'\] \(TypeError: .*; legal are a",
+        ),
+        ({"action_space": lambda self, agent: None}, r"action_space of agent 'a' is None; legal is a space of gymn"),
+        (
+            {"get_action_space": lambda self, agent: {"a": Discrete(2)}[agent]},
+            r"no action_space for each .*KeyError: 'b",
+        ),
+        ({"possible_agents": property(lambda self: 5, lambda self, _: None)}, "lists no `possible_agents`"),
+        ({"observation_layouts": 3}, "observation_layouts must be a dict by agent, not 3"),
+        (
+            {"observation_layouts": {"a": 3}},
+            "The layout of the observation of agent 'a' is 3; legal is a list of groups",
+        ),
+    ],
+)
+def test_what_an_environment_says_of_itself_is_checked(attributes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Team.of(StackedEnv([type("Odd", (Pair,), attributes)()]), with_state=False)
 
 
 def test_teams_and_states_that_are_none_are_named() -> None:

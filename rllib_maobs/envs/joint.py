@@ -7,7 +7,7 @@ environment lists its agents.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from inspect import signature
@@ -22,7 +22,7 @@ from ray.tune.registry import register_env
 
 from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
-from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
+from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult, layouts_of
 from rllib_maobs.layout import Entities, Layout, flat
 
 
@@ -111,7 +111,7 @@ class WithAgentIds:
         layouts: dict[str, Groups] = {
             agent: flat(flatdim(env.observation_spaces[agent]), "observation") for agent in self.observation_spaces
         }
-        known: Mapping[str, Groups | None] = getattr(env, "observation_layouts", None) or {}
+        known = layouts_of(env)
         layouts.update({agent: layout for agent, layout in known.items() if layout is not None})
         self.observation_layouts = {agent: (*self.id_layout, *layout) for agent, layout in layouts.items()}
         self.state_layout: Groups | None = getattr(env, "state_layout", None)
@@ -260,7 +260,8 @@ class StackedEnv:
                 f"{self._name} is an AEC environment, whose agents act in turns; legal are RLlib MultiAgentEnvs and "
                 f"PettingZoo ParallelEnvs: use its parallel_env(), or pettingzoo.utils.aec_to_parallel(env)."
             )
-        self.agents: list[str] = list(getattr(env, "possible_agents", None) or [])
+        agents = getattr(env, "possible_agents", None)
+        self.agents: list[str] = list(agents) if isinstance(agents, Iterable) else []
         if not self.agents:
             raise ValueError(
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
@@ -302,10 +303,22 @@ class StackedEnv:
 
     def _spaces(self, env: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         """Each agent's spaces of observations and of actions."""
-        observation, action = (
-            getattr(env, f"get_{which}", None) or getattr(env, which) for which in ("observation_space", "action_space")
-        )
-        return {agent: observation(agent) for agent in self.agents}, {agent: action(agent) for agent in self.agents}
+        spaces: list[dict[str, Any]] = []
+        for which in ("observation_space", "action_space"):
+            try:
+                space_of = getattr(env, f"get_{which}", None) or getattr(env, which)
+                spaces.append({agent: space_of(agent) for agent in self.agents})
+            except (AttributeError, LookupError, TypeError) as error:
+                raise ValueError(
+                    f"{self._name} has no {which} for each of {self.agents} ({type(error).__name__}: {error}); legal "
+                    f"are a method {which}(agent), or RLlib's dict {which}s."
+                ) from error
+            if unknown := [agent for agent, space in spaces[-1].items() if not isinstance(space, gym.Space)]:
+                raise ValueError(
+                    f"{self._name}: {which} of agent {unknown[0]!r} is {spaces[-1][unknown[0]]!r}; legal is a space of "
+                    f"gymnasium."
+                )
+        return spaces[0], spaces[1]
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`.
@@ -387,7 +400,9 @@ class StackedEnv:
         """Which agents terminated `(N,)` if the episode is over (the others were truncated), or None if it goes on."""
         for flags in (terminations, truncations):
             for name, flag in flags.items():
-                if name not in self._flagged or not isinstance(flag, bool | np.bool_ | int | np.integer | None):
+                if name not in self._flagged or not (
+                    flag is None or (isinstance(flag, bool | np.bool_ | int | np.integer) and flag in (0, 1))
+                ):
                     legal = "True or False for each agent, and for '__all__'"
                     raise self._error(copy, f"the termination or truncation of {name!r} is {flag!r}", legal)
         terminated, truncated = (
@@ -429,7 +444,10 @@ class StackedEnv:
         for agent in self.agents:
             value: Any = reward.get(agent, "missing")
             if type(value) is not float:  # the rest need a closer look
-                array = np.asarray(value)
+                try:
+                    array = np.asarray(value)
+                except (ValueError, RuntimeError):  # lists of unequal lengths, tensors with gradients
+                    array = np.array(None)
                 # True is none either: flags in the place of rewards would be believed.
                 if array.ndim or array.dtype.kind not in "iuf":
                     what = f"the reward of agent {agent!r} is {value!r}"

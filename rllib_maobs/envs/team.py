@@ -202,7 +202,7 @@ class Team:
                     f"to scale to, whose distance is finite in their type (of integers, bounds within 2**53)."
                 )
         observations = tuple(env.observation_spaces[agent] for agent in agents)
-        layouts: dict[str, Groups | None] = dict(getattr(env, "observation_layouts", None) or {})
+        layouts: dict[str, Groups | None] = dict(layouts_of(env))
         ids: Layout = getattr(env, "id_layout", ())
         for agent, own in (observation_layouts or {}).items():
             layouts[agent] = (*ids, *own) if isinstance(own, Iterable) else own
@@ -218,6 +218,14 @@ class Team:
             ),
             _state_layout(env, state_layout) if with_state else None,
         )
+
+
+def layouts_of(env: Any) -> Mapping[str, Groups | None]:
+    """What an environment says its observations are made of, by agent; empty if it does not say."""
+    layouts = getattr(env, "observation_layouts", None) or {}
+    if not isinstance(layouts, Mapping):
+        raise ValueError(f"An environment's observation_layouts must be a dict by agent, not {layouts!r}.")
+    return layouts
 
 
 def _by_name(agent: str) -> tuple[list[str | int], str]:
