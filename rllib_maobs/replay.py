@@ -174,6 +174,7 @@ class JointReplayBuffer(Checkpointable):
             )
             for name, shape in shapes.items()
         }
+        self._shapes = shapes
         # Rows are numbered for ever; row i lies at i % capacity and is there while i >= head - capacity.
         self._head = 0
         self._next = np.full(capacity, _NONE, dtype=np.int64)
@@ -227,6 +228,11 @@ class JointReplayBuffer(Checkpointable):
                 restarted runner) breaks the link instead of joining two episodes.
         """
         length, copies = truncated.shape
+        if terminated.shape != (length, copies, self._arguments["num_agents"]):
+            raise ValueError(
+                f"'terminated' must be an array {(length, copies, self._arguments['num_agents'])}, as 'truncated' is "
+                f"one of {truncated.shape}, not {terminated.shape}."
+            )
         done = terminated.all(-1) | truncated
         steps = length * copies
         row = self._head + np.arange(steps).reshape(length, copies)
@@ -255,17 +261,22 @@ class JointReplayBuffer(Checkpointable):
         self._previous[row % self.capacity] = previous
         self._previous[last % self.capacity] = row[done]
 
-        self._write(row.reshape(-1), obs=obs, actions=actions, rewards=rewards, terminated=terminated)
-        self._write(last, obs=final_obs)
-        if "state" in self._columns:
-            self._write(row.reshape(-1), state=state)
-            self._write(last, state=final_state)
-        if "recurrent_state" in self._columns:
-            self._write(row.reshape(-1), recurrent_state=recurrent_state)
-            self._write(last, recurrent_state=final_recurrent_state)
+        rows, ends = (length, copies), (last.size,)
+        self._write(row.reshape(-1), rows, obs=obs, actions=actions, rewards=rewards, terminated=terminated)
+        self._write(last, ends, obs=final_obs)
+        for name, now, final in (
+            ("state", state, final_state),
+            ("recurrent_state", recurrent_state, final_recurrent_state),
+        ):
+            if name in self._columns:
+                self._write(row.reshape(-1), rows, **{name: now})
+                self._write(last, ends, **{name: final})
+            elif now is not None:
+                raise ValueError(f"{name!r} was given, but this replay buffer stores none.")
         self._head += steps + last.size
 
-    def _write(self, rows: NDArray[np.int64], **columns: NDArray[Any] | None) -> None:
+    def _write(self, rows: NDArray[np.int64], leading: tuple[int, ...], **columns: NDArray[Any] | None) -> None:
+        """Writes arrays `(*leading, ...)` to rows that follow one another."""
         if rows.size == 0:
             return
         # Rows are consecutive: one or two slices instead of an index.
@@ -275,11 +286,9 @@ class JointReplayBuffer(Checkpointable):
             column = self._columns[name]
             if values is None:
                 raise ValueError(f"The replay buffer stores {name!r}, but none was given.")
-            if values.shape[1 - column.ndim :] != column.shape[1:]:
-                raise ValueError(
-                    f"{name!r} has shape {values.shape}, but in this replay buffer it must end with "
-                    f"{tuple(column.shape[1:])}."
-                )
+            if getattr(values, "shape", None) != (expected := leading + self._shapes[name]):
+                what = name if len(leading) == 2 else f"final_{name}"
+                raise ValueError(f"{what!r} must be an array {expected}, not {np.shape(values)}.")
             # np.require: arrays from a remote runner are read-only, which torch warns of.
             dtype = np.bool_ if column.dtype == torch.bool else np.float32
             flat = torch.from_numpy(np.require(values, dtype, "W")).reshape(rows.size, *column.shape[1:])

@@ -372,10 +372,16 @@ def test_what_a_buffer_cannot_be(arguments: tuple[Any, ...], message: str) -> No
 def test_columns_of_another_team_and_illegal_lengths_are_refused() -> None:
     """Arrays of as many numbers in another order would fit."""
     buffer, columns = JointReplayBuffer(400, N, O, A), Simulator(2).fragment(5)
-    with pytest.raises(
-        ValueError, match=r"'obs' has shape \(5, 2, 4, 3\), but in this replay buffer .* end with \(3, 4\)"
+    for wrong, message in (
+        ({"obs": columns["obs"].swapaxes(2, 3)}, r"'obs' must be an array \(5, 2, 3, 4\), not \(5, 2, 4, 3\)"),
+        ({"rewards": columns["rewards"][:, :1]}, r"'rewards' must be an array \(5, 2, 3\), not \(5, 1, 3\)"),
+        ({"rewards": columns["rewards"].tolist()}, r"'rewards' must be an array"),
+        ({"final_obs": columns["final_obs"][1:]}, r"'final_obs' must be an array \(2, 3, 4\), not \(1, 3, 4\)"),
+        ({"terminated": columns["terminated"][..., 0]}, r"'terminated' must be an array \(5, 2, 3\), as 'truncated'"),
+        ({"state": columns["obs"]}, "'state' was given, but this replay buffer stores none"),
     ):
-        buffer.add(**columns | {"obs": columns["obs"].swapaxes(2, 3)})
+        with pytest.raises(ValueError, match=message):
+            JointReplayBuffer(400, N, O, A).add(**columns | wrong)
     buffer.add(**columns)
     for wrong in ({"n_step": 0}, {"seq_length": -1}):
         with pytest.raises(ValueError, match=r"n_step must be >= 1 and seq_length >= 0, not"):
