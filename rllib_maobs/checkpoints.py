@@ -27,6 +27,8 @@ def find_checkpoint(path: str | Path) -> Path:
     Raises:
         ValueError: If it is neither.
     """
+    if not str(path):  # which would be the present folder
+        raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
     folder = Path(path).expanduser().resolve()
     for found in (folder, *sorted(folder.glob("checkpoint_*"), reverse=True)):
         if found.joinpath(*_MODULES).is_dir():

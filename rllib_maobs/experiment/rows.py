@@ -93,6 +93,8 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If one is unknown or illegal; names the legal ones.
     """
+    if not isinstance(row, Mapping):
+        raise ValueError(f"Row {name!r}: {row!r} is illegal; legal: a mapping of settings.")
     algorithm = row.get("algorithm", "")
     if algorithm not in maobs.ALGORITHMS:
         legal = ", ".join(maobs.ALGORITHMS)
