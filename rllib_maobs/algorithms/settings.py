@@ -22,6 +22,7 @@ PositiveInt = Annotated[int, Range(1)]
 NonNegativeInt = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0.0, exclusive=True)]
 NonNegative = Annotated[float, Range(0.0)]
+Amount = NonNegativeInt | NonNegative  # of a resource: a whole number stays one
 
 CALLBACKS = tuple(
     f"callbacks_{name}"
@@ -58,7 +59,7 @@ LEGAL: dict[str, Any] = {
     "num_steps_sampled_before_learning_starts": NonNegativeInt,
     "store_buffer_in_checkpoints": bool,
     # RLlib's, in the order of `METHODS`.
-    "num_cpus_for_main_process": NonNegative,
+    "num_cpus_for_main_process": Amount,
     "custom_resources_for_main_process": dict,
     "placement_strategy": Literal["PACK", "SPREAD", "STRICT_PACK", "STRICT_SPREAD"],
     "torch_compile_learner": bool,
@@ -70,15 +71,15 @@ LEGAL: dict[str, Any] = {
     "num_env_runners": NonNegativeInt,
     "num_envs_per_env_runner": PositiveInt,
     "create_env_on_local_worker": bool,
-    "num_cpus_per_env_runner": NonNegative,
+    "num_cpus_per_env_runner": Amount,
     "custom_resources_per_env_runner": dict,
     "validate_env_runners_after_construction": bool,
     "sample_timeout_s": Positive | None,
     "max_requests_in_flight_per_env_runner": PositiveInt,
     "rollout_fragment_length": PositiveInt | Literal["auto"],
     "explore": bool,
-    "num_cpus_per_learner": NonNegative | Literal["auto"],
-    "num_gpus_per_learner": NonNegative,
+    "num_cpus_per_learner": Amount | Literal["auto"],
+    "num_gpus_per_learner": Amount,
     "local_gpu_idx": NonNegativeInt,
     "learner_class": type | None,
     "learner_config_dict": dict,
@@ -155,12 +156,18 @@ HONOURED: dict[str, str] = {
     **_each("on_env_runners_recreated on_checkpoint_loaded on_environment_created on_sample_end"),
     **_each("on_episode_created on_episode_start on_episode_step on_episode_end"),
     # evaluation
-    **_each("evaluation_interval evaluation_duration evaluation_duration_unit evaluation_config"),
+    **_each("evaluation_interval evaluation_duration evaluation_duration_unit"),
+    **_each(
+        "evaluation_config", "settings of the runners that evaluate; others would do nothing there, and are errors"
+    ),
     **_each("evaluation_auto_duration_min_env_steps_per_sample evaluation_auto_duration_max_env_steps_per_sample"),
     **_each("evaluation_sample_timeout_s evaluation_num_env_runners evaluation_unhealthy_workers_timeout_s"),
     **_each("evaluation_parallel_to_training", "needs evaluation_num_env_runners"),
     **_each("evaluation_error_after_n_consecutive_skips evaluation_force_reset_envs_before_iteration"),
-    **_each("custom_evaluation_function"),
+    **_each(
+        "custom_evaluation_function",
+        "the metrics that it returns are results; on_evaluate_end sees those alone that it logs in algo.metrics",
+    ),
     # multi_agent, rl_module
     **_each("policies policy_mapping_fn", "agents of one policy share its networks"),
     **_each("model_config", "hidden_sizes, activation and lstm_cell_size, where a network takes them"),
