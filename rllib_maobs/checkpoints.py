@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ from rllib_maobs.algorithms import JointAlgorithm, JointConfig
 from rllib_maobs.algorithms.checks import built_modules
 from rllib_maobs.learner.networks import MIXER
 
+logger = logging.getLogger(__name__)
 _MODULES = ("learner_group", "learner", "rl_module")
 
 
@@ -25,6 +27,8 @@ def find_checkpoint(path: str | Path) -> Path:
     Raises:
         ValueError: If it is neither.
     """
+    if not str(path):  # which would be the present folder
+        raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
     folder = Path(path).expanduser().resolve()
     for found in (folder, *sorted(folder.glob("checkpoint_*"), reverse=True)):
         if found.joinpath(*_MODULES).is_dir():
@@ -74,7 +78,13 @@ def saved_networks(config: JointConfig, checkpoint: str | Path) -> dict[str, dic
     if missing := [mid for mid, source in sources.items() if source not in folders]:
         raise ValueError(f"{str(checkpoint)!r} has no networks for {missing}; it has those of {sorted(folders)}.")
     for mid, module in here.items():
-        states[mid] = RLModule.from_checkpoint(folders[sources[mid]]).get_state()
+        source = RLModule.from_checkpoint(folders[sources[mid]])
+        if source.action_space != module.action_space:
+            logger.warning(
+                f"The networks of policy {mid!r} in {str(checkpoint)!r} acted in {source.action_space}, here they act "
+                f"in {module.action_space}: the same output is another action."
+            )
+        states[mid] = source.get_state()
         there = {name: tuple(value.shape) for name, value in states[mid].items()}
         expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
         for name in dict.fromkeys([*expected, *there]):

@@ -76,6 +76,8 @@ def as_layout(groups: Iterable[Iterable[Any]], size: int | None, owner: str) -> 
     Raises:
         ValueError: If a value is not legal, a name is there twice, or the lengths do not add up.
     """
+    if not isinstance(groups, Iterable) or isinstance(groups, str):
+        raise ValueError(f"The layout of the {owner} is {groups!r}; legal is a list of groups (name, count, size).")
     layout = []
     for group in groups:
         try:

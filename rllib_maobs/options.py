@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import numbers
 import types
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -31,8 +31,9 @@ class Range:
         return (value > self.low if self.exclusive else value >= self.low) and value <= self.high
 
     def __str__(self) -> str:
-        lower = f"{'>' if self.exclusive else '>='} {self.low:g}"
-        return lower if self.high == np.inf else f"{lower} and <= {self.high:g}"
+        low, high = (value if isinstance(value, int) else f"{value:g}" for value in (self.low, self.high))
+        lower = f"{'>' if self.exclusive else '>='} {low}"
+        return lower if self.high == np.inf else f"{lower} and <= {high}"
 
 
 def closest(name: str, legal: list[str]) -> str:
@@ -117,7 +118,7 @@ def _describe(hint: Any) -> str:
         return f"{_describe(inner)} {limits}"
     if get_origin(hint) is Literal:
         return ", ".join(repr(value) for value in get_args(hint))
-    return _WORDS.get(hint, str(hint))
+    return _WORDS.get(hint, getattr(hint, "__name__", str(hint)))
 
 
 _WORDS = {
@@ -126,5 +127,11 @@ _WORDS = {
     bool: "True or False",
     str: "a string",
     list: "a list",
+    tuple: "a tuple",
+    set: "a set",
+    dict: "a dict",
+    Mapping: "a dict",
+    type: "a class",
+    Callable: "a function",
     type(None): "None",
 }

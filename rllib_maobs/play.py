@@ -45,13 +45,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_intermixed_args(arguments)
     if args.episodes < 1:
         parser.error(f"--episodes {args.episodes} is illegal; legal: an integer >= 1")
+    if not 0 <= args.seed < 2**63 - args.episodes:
+        parser.error(f"--seed {args.seed} is illegal; legal: an integer >= 0 of 63 bits")
     try:
-        mode = "rgb_array" if args.record else None if args.no_window else "human"
+        mode = "rgb_array" if args.record is not None else None if args.no_window else "human"
         options = parse_options(args.options)
         saved = {name: value for name, value in saved_options(args.policy, args.env).items() if name not in options}
         env = parallel_env(args.env, render_mode=mode, **saved, **options)
         policy = make_policy(env.vector, args.policy, args.seed)
-        recorder = Recorder(args.record) if args.record else None
+        recorder = Recorder(args.record) if args.record is not None else None
     except (ValueError, ImportError, NotImplementedError) as error:
         parser.error(str(error))
     metrics = play(env, policy, args.episodes, args.seed, recorder)
@@ -69,15 +71,17 @@ def parse_options(pairs: Sequence[str]) -> dict[str, Any]:
     """Turn `["gap=0.3", "physics=solid"]` into keywords; values are Python literals, or else strings.
 
     Raises:
-        ValueError: If an entry has no "=", or names no option of a task.
+        ValueError: If an entry has no "=", or names no option of a task, or one that is there already.
     """
-    options = {}
+    options = dict[str, Any]()
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals:
             raise ValueError(f"{pair!r} is no option; write NAME=VALUE, such as horizon=50")
         if name in ("scenario", "render_mode"):
             raise ValueError(f"{name}=... is no option of a task; legal are those of its class, such as horizon=50")
+        if name in options:
+            raise ValueError(f"{name}=... is given twice")
         try:
             options[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError):

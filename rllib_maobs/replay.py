@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +13,8 @@ from numpy.typing import NDArray
 from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from torch import Tensor
+
+from rllib_maobs.options import Range, check_value
 
 _NONE = -1  # "no such row" in the links between rows
 
@@ -83,6 +87,15 @@ def _unbound(part: Any) -> Any:
     return [type(part)(*(c[i] if isinstance(c, list) else c for c in columns)) for i in range(count)]
 
 
+def memory_of(device: torch.device | str) -> float:
+    """Bytes of memory that there are for a device: of the GPU, or of the machine; infinity where nobody says."""
+    if torch.device(device).type == "cuda":
+        return float(torch.cuda.get_device_properties(device).total_memory)
+    if hasattr(os, "sysconf"):  # not on Windows
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return math.inf
+
+
 class JointReplayBuffer(Checkpointable):
     """Uniform replay of a fixed team's joint transitions.
 
@@ -104,6 +117,9 @@ class JointReplayBuffer(Checkpointable):
             stores none. An LSTM's is (2, H): 2.3 GB for 500 000 rows of nine agents with H = 64.
         seed: Seed of the sampling.
         device: Where the rows live and are sampled to.
+
+    Raises:
+        ValueError: If a number is not legal, or the full ring would not fit into memory.
     """
 
     def __init__(
@@ -118,6 +134,14 @@ class JointReplayBuffer(Checkpointable):
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
+        for name, size, low in (
+            ("capacity", capacity, 1),
+            ("num_agents", num_agents, 1),
+            ("observation_size", observation_size, 1),
+            ("action_size", action_size, 1),
+            ("state_size", state_size, 0),
+        ):
+            check_value(size, Annotated[int, Range(low)], name, type(self).__name__)
         self.capacity = capacity
         self._arguments: dict[str, Any] = {
             "capacity": capacity,
@@ -137,6 +161,12 @@ class JointReplayBuffer(Checkpointable):
             shapes["state"] = (state_size,)
         if recurrent_state is not None:
             shapes["recurrent_state"] = (num_agents, *recurrent_state)
+        row = 16 + sum(math.prod(shape) * (1 if name == "terminated" else 4) for name, shape in shapes.items())
+        if capacity * row > (memory := memory_of(device)):
+            raise ValueError(
+                f"A replay buffer of {capacity} rows takes {capacity * row / 1e9:,.1f} GB, {row} bytes for each joint "
+                f"step, and there are {memory / 1e9:,.1f} GB: legal is a capacity up to {int(memory // row)}."
+            )
         # Empty memory is not touched, so it costs nothing until rows are written to it.
         self._columns = {
             name: torch.empty(
@@ -144,6 +174,7 @@ class JointReplayBuffer(Checkpointable):
             )
             for name, shape in shapes.items()
         }
+        self._shapes = shapes
         # Rows are numbered for ever; row i lies at i % capacity and is there while i >= head - capacity.
         self._head = 0
         self._next = np.full(capacity, _NONE, dtype=np.int64)
@@ -197,6 +228,11 @@ class JointReplayBuffer(Checkpointable):
                 restarted runner) breaks the link instead of joining two episodes.
         """
         length, copies = truncated.shape
+        if terminated.shape != (length, copies, self._arguments["num_agents"]):
+            raise ValueError(
+                f"'terminated' must be an array {(length, copies, self._arguments['num_agents'])}, as 'truncated' is "
+                f"one of {truncated.shape}, not {terminated.shape}."
+            )
         done = terminated.all(-1) | truncated
         steps = length * copies
         row = self._head + np.arange(steps).reshape(length, copies)
@@ -225,17 +261,22 @@ class JointReplayBuffer(Checkpointable):
         self._previous[row % self.capacity] = previous
         self._previous[last % self.capacity] = row[done]
 
-        self._write(row.reshape(-1), obs=obs, actions=actions, rewards=rewards, terminated=terminated)
-        self._write(last, obs=final_obs)
-        if "state" in self._columns:
-            self._write(row.reshape(-1), state=state)
-            self._write(last, state=final_state)
-        if "recurrent_state" in self._columns:
-            self._write(row.reshape(-1), recurrent_state=recurrent_state)
-            self._write(last, recurrent_state=final_recurrent_state)
+        rows, ends = (length, copies), (last.size,)
+        self._write(row.reshape(-1), rows, obs=obs, actions=actions, rewards=rewards, terminated=terminated)
+        self._write(last, ends, obs=final_obs)
+        for name, now, final in (
+            ("state", state, final_state),
+            ("recurrent_state", recurrent_state, final_recurrent_state),
+        ):
+            if name in self._columns:
+                self._write(row.reshape(-1), rows, **{name: now})
+                self._write(last, ends, **{name: final})
+            elif now is not None:
+                raise ValueError(f"{name!r} was given, but this replay buffer stores none.")
         self._head += steps + last.size
 
-    def _write(self, rows: NDArray[np.int64], **columns: NDArray[Any] | None) -> None:
+    def _write(self, rows: NDArray[np.int64], leading: tuple[int, ...], **columns: NDArray[Any] | None) -> None:
+        """Writes arrays `(*leading, ...)` to rows that follow one another."""
         if rows.size == 0:
             return
         # Rows are consecutive: one or two slices instead of an index.
@@ -245,6 +286,9 @@ class JointReplayBuffer(Checkpointable):
             column = self._columns[name]
             if values is None:
                 raise ValueError(f"The replay buffer stores {name!r}, but none was given.")
+            if getattr(values, "shape", None) != (expected := leading + self._shapes[name]):
+                what = name if len(leading) == 2 else f"final_{name}"
+                raise ValueError(f"{what!r} must be an array {expected}, not {np.shape(values)}.")
             # np.require: arrays from a remote runner are read-only, which torch warns of.
             dtype = np.bool_ if column.dtype == torch.bool else np.float32
             flat = torch.from_numpy(np.require(values, dtype, "W")).reshape(rows.size, *column.shape[1:])
@@ -266,8 +310,10 @@ class JointReplayBuffer(Checkpointable):
             The transitions; all their tensors have `shape` in the place of B.
 
         Raises:
-            ValueError: If no complete transition is stored yet.
+            ValueError: If no complete transition is stored yet, or a length is not legal.
         """
+        if n_step < 1 or seq_length < 0:
+            raise ValueError(f"n_step must be >= 1 and seq_length >= 0, not {n_step} and {seq_length}.")
         rows = self._draw(int(np.prod(shape)), seq_length)
         rewards = self._columns["rewards"]
         last, steps = rows, np.ones(rows.size)
@@ -275,6 +321,8 @@ class JointReplayBuffer(Checkpointable):
         for _ in range(n_step - 1):
             ahead = self._next[last] % self.capacity
             more = self._next[ahead] != _NONE
+            if not more.any():
+                break  # all have come to the ends of their episodes
             factor = torch.from_numpy((gamma**steps).astype(np.float32)).to(rewards.device)[:, None]
             # A row without a successor may have no reward at all: its memory is not even zero.
             further = factor * rewards.index_select(0, self._places(ahead))

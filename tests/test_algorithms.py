@@ -230,7 +230,10 @@ class PictureAgents(TwoAgents):
             r"EpsilonGaussian has no setting 'eps' .*'epsilon'.*; legal are epsilon, noise",
         ),
         (lambda c: c.training(grad_clip=0.0), r"grad_clip=0.0 is illegal; legal: a number > 0 or None"),
-        (lambda c: c.training(grad_clip_by="max"), r"grad_clip_by` \(max\) must be one of"),
+        (
+            lambda c: c.training(grad_clip_by="max"),
+            r"grad_clip_by='max' is illegal; legal: 'global_norm', 'norm', 'value'",
+        ),
         (
             lambda c: c.training(actor="gru"),
             r"actor 'gru' is illegal.*; legal are 'mlp', 'lstm', .*, a subclass of Actor, or where",

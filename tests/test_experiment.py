@@ -596,6 +596,26 @@ def test_rows_with_unknown_settings_are_refused(row: dict[str, Any], message: st
         replace(EXPERIMENT, algorithms=("a",), variants={"a": row})
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": 3}, "Experiment: name=3 is illegal; legal: a string"),
+        ({"name": "a/b"}, "name='a/b' is illegal; legal is a name of a folder"),
+        ({"algorithms": "iddpg"}, "algorithms='iddpg' is illegal; legal: a list or a tuple"),
+        ({"algorithms": ("iddpg", "iddpg")}, "legal are one or more, once each"),
+        ({"algorithms": ()}, "legal are one or more, once each"),
+        ({"training": 3}, "training=3 is illegal; legal: a dict"),
+        ({"env_config": [1]}, r"env_config=\[1\] is illegal; legal: a dict"),
+        ({"stop_timesteps": 0}, "stop_timesteps=0 is illegal; legal: an integer >= 1"),
+        ({"variants": {"z": {"algorithm": "iddpg"}}}, "variants 'z' are not among the algorithms .* not be trained"),
+        ({"variants": {"iddpg": 3}}, "Row 'iddpg': 3 is illegal; legal: a mapping of settings"),
+    ],
+)
+def test_what_an_experiment_cannot_be(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(EXPERIMENT, **change)
+
+
 def test_quick_algorithms_are_some_of_all() -> None:
     with pytest.raises(ValueError, match="Unknown quick_algorithms 'facmac'; legal are those of algorithms: iddpg, ma"):
         replace(EXPERIMENT, quick_algorithms=("iddpg", "facmac"))

@@ -113,6 +113,38 @@ class NoState(Pair):
         ),
         (lambda: Pair(lambda env, o, r, *rest: (o, {"a": 1.0}, *rest)), r"the reward of agent 'b' is 'missing'"),
         (lambda: Pair(lambda env, o, r, *rest: (o, r | {"a": None}, *rest)), r"the reward of agent 'a' is None"),
+        # What float() would take for one.
+        (lambda: Pair(lambda env, o, r, *rest: (o, r | {"a": "3"}, *rest)), r"the reward of agent 'a' is '3' in env"),
+        (lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": True}, *rest)), r"the reward of agent 'b' is True in"),
+        (lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": np.bool_(0)}, *rest)), r"reward of agent 'b' is .*False"),
+        (
+            lambda: Pair(lambda env, o, r, *rest: (o, r | {"b": [1, [2]]}, *rest)),
+            r"reward of agent 'b' is \[1, \[2\]\]",
+        ),
+        (
+            lambda: Pair(lambda env, o, r, *rest: (o, r | {"c": 1.0}, *rest)),
+            r"there are rewards of \['c'\] in .*; legal",
+        ),
+        (
+            lambda: Pair(lambda env, o, *rest: (o | {"a": np.array(["1", "2", "3"])}, *rest)),
+            r"observation of agent 'a' is no array of numbers \(values of dtype <U1\)",
+        ),
+        (
+            lambda: Pair(lambda env, o, *rest: (o | {"a": torch.zeros(3, requires_grad=True)}, *rest)),
+            r"observation of agent 'a' is no array of numbers \(Can't call numpy",
+        ),
+        (
+            lambda: Pair(lambda env, *rest: (*rest[:-1], {"a": [1], "b": {}})),
+            r"Pair: the info of 'a' is \[1\] in environment copy 0 at step 1 .*; legal: a dict, or None",
+        ),
+        (
+            lambda: Pair(lambda env, *rest: (*rest[:-1], {"b": {"episode_metrics": {"x": [1, 2]}}})),
+            r"episode_metrics in the info of 'b' are .*x.* at step 5 .*; legal: a dict of single numbers by name",
+        ),
+        (
+            lambda: Pair(lambda env, *rest: (*rest[:-1], {"a": {"episode_metrics": 3}})),
+            r"episode_metrics in the info of 'a' are 3 in",
+        ),
         (
             lambda: Pair(lambda env, o, *rest: (o | {"b": np.zeros(env.t)}, *rest)),
             r"observation of agent 'b' has 1 numbers in environment copy 0 at step 1 .*; legal: what is in its space B",
@@ -153,6 +185,7 @@ def test_copies_have_the_same_spaces() -> None:
     ("flags", "message"),
     [
         ({"a": "False", "b": False}, "the termination or truncation of 'a' is 'False' in environment copy 0 at step 1"),
+        ({"a": 7, "b": False}, "the termination or truncation of 'a' is 7"),
         ({"a": False, "b": False, "__ALL__": False}, "the termination or truncation of '__ALL__' is False"),
     ],
 )
@@ -161,8 +194,24 @@ def test_flags_are_flags_of_agents(flags: dict[str, Any], message: str) -> None:
         played(StackedEnv([Pair(lambda env, obs, reward, terminated, *rest: (obs, reward, flags, *rest))]), 1)
 
 
+def test_any_agent_may_tell_the_metrics() -> None:
+    infos = {"b": {"episode_metrics": {"x": np.float64(2.0)}}, "a": {"episode_metrics": {"y": 1}}}
+    *_, last = played(StackedEnv([Pair(), Pair(lambda env, *rest: (*rest[:-1], infos))]))
+    metrics = {name: values.tolist() for name, values in last[4]["episode_metrics"].items()}
+    np.testing.assert_equal(metrics, {"x": [np.nan, 2.0], "y": [np.nan, 1.0]})
+
+
+def test_rewards_are_numbers_of_any_kind() -> None:
+    given = iter([1, np.float32(2.0), np.array(3.0), torch.tensor(4.0), np.int64(5)])
+
+    def change(env: Pair, o: Any, r: Any, *rest: Any) -> Any:
+        return o, r | {"b": next(given)}, *rest
+
+    assert [result[1][0, 1] for result in played(StackedEnv([Pair(change)]))] == [1.0, 2.0, 3.0, 4.0, 5.0]
+
+
 def test_infos_of_none_say_nothing() -> None:
-    for infos in ({"a": None, "b": None}, None):
+    for infos in ({"a": None, "b": None}, None, {"a": {"episode_metrics": None}, "b": None}):
         *_, last = played(StackedEnv([Pair(lambda env, *rest, infos=infos: (*rest[:-1], infos))]))
         assert last[3].all() and not last[4].get("episode_metrics")
 
@@ -199,6 +248,16 @@ def test_every_copy_has_its_own_config() -> None:
     make_joint_env(creator, context, 3)
     assert seen == [(7, 2, 0), (7, 2, 1), (7, 2, 2)]
     assert context["horizon"] == 7 and nested == {"limits": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    "space", [Box(0, 1, (2,), np.bool_), Box(0.0, 1.0, (2, 2)), Box(0.0, 1.0, (0,)), gym.spaces.MultiBinary(2)]
+)
+def test_actions_that_are_no_vectors_of_numbers_are_refused(space: Any) -> None:
+    with pytest.raises(
+        ValueError, match=r"The action space of agent 'a' is .*; legal are Box of one dimension, of int"
+    ):
+        Team.of(StackedEnv([Pair(space=space)]), with_state=False)
 
 
 @pytest.mark.parametrize("space", [Discrete(3), Box(0.0, 1.0, (2, 2)), gym.spaces.Dict({"x": Discrete(2)})])
@@ -433,6 +492,31 @@ class Wordy(Pair):
 
 class Still(Pair):
     state = np.zeros(2)  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        (
+            {"observation_space": None},
+            r"has no observation_space for each of \['a', 'b'\] \(TypeError: .*; legal are a",
+        ),
+        ({"action_space": lambda self, agent: None}, r"action_space of agent 'a' is None; legal is a space of gymn"),
+        (
+            {"get_action_space": lambda self, agent: {"a": Discrete(2)}[agent]},
+            r"no action_space for each .*KeyError: 'b",
+        ),
+        ({"possible_agents": property(lambda self: 5, lambda self, _: None)}, "lists no `possible_agents`"),
+        ({"observation_layouts": 3}, "observation_layouts must be a dict by agent, not 3"),
+        (
+            {"observation_layouts": {"a": 3}},
+            "The layout of the observation of agent 'a' is 3; legal is a list of groups",
+        ),
+    ],
+)
+def test_what_an_environment_says_of_itself_is_checked(attributes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Team.of(StackedEnv([type("Odd", (Pair,), attributes)()]), with_state=False)
 
 
 def test_teams_and_states_that_are_none_are_named() -> None:

@@ -89,6 +89,11 @@ def test_options_are_literals_or_words():
         (["tunnel", "gap"], "'gap' is no option; write NAME=VALUE"),
         (["tunnel", "gasp=1"], "Tunnel has no option 'gasp' (did you mean 'gap'?)"),
         (["tunnel", "--episodes", "0"], "--episodes 0 is illegal"),
+        (["tunnel", "--seed", "-1"], "--seed -1 is illegal"),
+        (["tunnel", "--seed", str(2**63)], "is illegal; legal: an integer >= 0 of 63 bits"),
+        (["tunnel", "--record", ""], "cannot record to ''"),
+        (["tunnel", "horizon=3", "horizon=4"], "horizon=... is given twice"),
+        (["tunnel", "--policy", ""], "'' is no checkpoint"),
         (["tunnel", "--record", "film.avi"], "cannot record to 'film.avi'"),
         (
             ["tunnel", "--policy", "hueristic", "--no-window"],

@@ -333,3 +333,56 @@ def test_a_buffer_saved_with_one_flag_for_all_is_read() -> None:
 def test_who_terminated_takes_a_byte_for_each_agent() -> None:
     buffer = JointReplayBuffer(500, N, O, A)
     assert buffer._columns["terminated"].nbytes == 500 * N
+
+
+def test_more_steps_than_an_episode_has_cost_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    buffer, simulator = JointReplayBuffer(400, N, O, A, seed=0), Simulator(2)
+    for _ in range(20):
+        buffer.add(**simulator.fragment(5))
+    looks = []
+    places = buffer._places
+    monkeypatch.setattr(buffer, "_places", lambda rows: looks.append(1) or places(rows))
+    state = buffer.get_state()
+    want = buffer.sample((64,), gamma=G, n_step=10)
+    few = len(looks)
+    buffer.set_state(state)
+    got = buffer.sample((64,), gamma=G, n_step=200)
+    assert len(looks) == 2 * few
+    assert torch.equal(got.rewards, want.rewards) and torch.equal(got.discount, want.discount)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0, N, O, A), "JointReplayBuffer: capacity=0 is illegal; legal: an integer >= 1"),
+        ((10.0, N, O, A), "capacity=10.0 is illegal"),
+        ((10, N, O, "2"), "action_size='2' is illegal"),
+        ((10, N, O, A, -1), "state_size=-1 is illegal; legal: an integer >= 0"),
+        (
+            (10**12, N, O, A),
+            r"rows takes 103,000.0 GB, 103 bytes for each .*, and there are .* GB: legal is a capacity up",
+        ),
+    ],
+)
+def test_what_a_buffer_cannot_be(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        JointReplayBuffer(*arguments)
+
+
+def test_columns_of_another_team_and_illegal_lengths_are_refused() -> None:
+    """Arrays of as many numbers in another order would fit."""
+    buffer, columns = JointReplayBuffer(400, N, O, A), Simulator(2).fragment(5)
+    for wrong, message in (
+        ({"obs": columns["obs"].swapaxes(2, 3)}, r"'obs' must be an array \(5, 2, 3, 4\), not \(5, 2, 4, 3\)"),
+        ({"rewards": columns["rewards"][:, :1]}, r"'rewards' must be an array \(5, 2, 3\), not \(5, 1, 3\)"),
+        ({"rewards": columns["rewards"].tolist()}, r"'rewards' must be an array"),
+        ({"final_obs": columns["final_obs"][1:]}, r"'final_obs' must be an array \(2, 3, 4\), not \(1, 3, 4\)"),
+        ({"terminated": columns["terminated"][..., 0]}, r"'terminated' must be an array \(5, 2, 3\), as 'truncated'"),
+        ({"state": columns["obs"]}, "'state' was given, but this replay buffer stores none"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            JointReplayBuffer(400, N, O, A).add(**columns | wrong)
+    buffer.add(**columns)
+    for wrong in ({"n_step": 0}, {"seq_length": -1}):
+        with pytest.raises(ValueError, match=r"n_step must be >= 1 and seq_length >= 0, not"):
+            buffer.sample((4,), gamma=G, **wrong)

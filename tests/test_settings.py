@@ -1,9 +1,11 @@
 """Every setting of RLlib does what it says or is refused, and so is what nobody knows or what would do nothing."""
 
+import inspect
 import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -105,6 +107,63 @@ def named(*agents: str) -> Any:
         ("maddpg", lambda c: setattr(c, "actor_lrr", 1.0), r"has no setting 'actor_lrr' \(did you mean 'actor_lr'"),
         ("maddpg", lambda c: c.update_from_dict({"taau": 1.0}), r"has no setting 'taau' \(did you mean 'tau'"),
         ("maddpg", lambda c: c.evaluation(evaluation_config={"exploer": False}), r"no setting 'exploer' .*'explore'"),
+        # What would do nothing in an evaluation.
+        *(
+            (
+                "maddpg",
+                lambda c, name=name, value=value: c.evaluation(evaluation_config={name: value}),
+                rf"^evaluation_config sets {name}={value}, which has no effect there: {instead}.*; legal are .*explore",
+            )
+            for name, value, instead in (
+                ("gamma", 0.5, "evaluation has its runners' settings alone"),
+                ("actor_lr", 0.5, "evaluation has its runners' settings alone"),
+                ("normalize_observations", True, "evaluation has its runners' settings alone"),
+                ("num_env_runners", 2, r"use evaluation\(evaluation_num_env_runners"),
+                ("rollout_fragment_length", 7, r"use evaluation\(evaluation_duration"),
+            )
+        ),
+        (
+            "maddpg",
+            lambda c: c.evaluation(evaluation_config={"seed": -1}),
+            r"seed=-1 is illegal; legal: an integer >= 0",
+        ),
+        # What is too large.
+        (
+            "maddpg",
+            lambda c: c.training(n_step=10**6),
+            r"^n_step \(1000000\) must not be larger than replay_buffer_cap",
+        ),
+        (
+            "maddpg",
+            lambda c: c.env_runners(num_envs_per_env_runner=10**6),
+            r"^num_envs_per_env_runner \(1000000\) times rollout_fragment_length \(1\) must not be .*\(5000\)",
+        ),
+        # Functions.
+        (
+            "maddpg",
+            lambda c: c.multi_agent(policies={"x"}, policy_mapping_fn=lambda agent: "x"),
+            r"^policy_mapping_fn can't be called as RLlib does, with 2 arguments \(str, NoneType\): too many",
+        ),
+        (
+            "maddpg",
+            lambda c: c.multi_agent(policies={"x"}, policy_mapping_fn=lambda agent, *a, **k: 3),
+            r"^policy_mapping_fn must return names of policies \(strings\), not 3",
+        ),
+        (
+            "maddpg",
+            lambda c: c.callbacks(int),
+            r"^callbacks_class must be a subclass of RLlibCallback, .* not <class 'i",
+        ),
+        (
+            "maddpg",
+            lambda c: c.callbacks(on_episode_end=[3]),
+            r"^callbacks_on_episode_end must be a function, .* not 3",
+        ),
+        (
+            "maddpg",
+            lambda c: c.environment(object),
+            r"^object can't be called with env_config \(.*\): legal is a class whose constructor takes it",
+        ),
         ("maddpg", lambda c: c.training(double_q=True), r"has no setting 'double_q'; it is one of iql, vdn, qmix\.$"),
         ("qmix", lambda c: c.training(critic_source="own"), r"QMIXConfig has no setting 'critic_source'; .* facmac\.$"),
         # What does nothing with this algorithm, or without another setting.
@@ -175,6 +234,32 @@ def test_wrong_settings_end_in_a_sentence(ray_session: None, algorithm: str, cha
     with pytest.raises(ValueError, match=message):
         change(config)
         config.validate()
+
+
+WRONG = ("x", None, [1], {"learner": 3}, -1, float("nan"), 3.5, True, object)
+OURS = [
+    ("training", name)
+    for name in inspect.signature(maobs.JointConfig.training).parameters
+    if name not in ("self", "kwargs")
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "name"), [(m, n) for m, n in EVERY if n in settings.HONOURED] + OURS, ids=lambda value: value
+)
+def test_values_of_a_wrong_type_end_in_a_sentence(method: str, name: str) -> None:
+    """Each is legal, or one sentence; whoever it says it, ourselves or RLlib."""
+    refused = 0
+    for value in WRONG:
+        config = maobs.FACMACConfig().environment("maobs/spread-3a")
+        try:
+            getattr(config, method)(**{name: value})
+            config.validate()
+        except ValueError as error:  # any other error fails the test
+            refused += 1
+            # RLlib names a wrong policy instead of the setting, and some parts of ours the wrong key.
+            assert any(word in str(error) for word in (name, "learner", "PolicyID")), error
+    assert refused >= 4
 
 
 def test_unknown_names_in_a_param_space_are_refused(ray_session: None) -> None:
@@ -270,14 +355,25 @@ def test_reporting_and_callbacks_are_honoured(ray_session: None) -> None:
         runners.local_env_runner.sample(num_episodes=3)
         metrics = runners.local_env_runner.get_metrics()
         algo.metrics.aggregate([metrics], key=("evaluation", "env_runners"))
-        return {"episodes": 3}, 30, 90
+        stats = {"num_episodes": metrics["num_episodes"]}
+        return {"episodes": 3 * calls.count("start"), "words": "three", "of_runner": stats}, np.int64(30), 90
 
     config.evaluation(evaluation_interval=1, custom_evaluation_function=evaluate)
     algo = config.build_algo()
+    algo.train()
     result = algo.train()
     assert result["learners"]["__all_modules__"][NUM_ENV_STEPS_TRAINED_LIFETIME] >= 800
+    assert {name: result["evaluation"][name] for name in ("episodes", "words", "of_runner")} == {
+        "episodes": 3 * calls.count("start"),  # what the function returns, not what it returned before
+        "words": "three",
+        "of_runner": {"num_episodes": 3},
+    }
     assert result["evaluation"]["env_runners"]["num_episodes"] == 3
-    assert calls == ["init", "start", "end", "result"]
+    assert calls == ["init", *["start", "end", "result"] * 2]
+    algo.config._is_frozen = False
+    algo.config.custom_evaluation_function = lambda algo, runners: {"episodes": 3}
+    with pytest.raises(ValueError, match=r"custom_evaluation_function returns {'episodes': 3}; legal are metrics"):
+        algo.evaluate()
     algo.stop()
 
 
@@ -341,6 +437,12 @@ def test_policies_differ_in_exploration_and_nothing_else(ray_session: None) -> N
     assert [learner.module[m].exploration.noise for m in learner.config.module_ids] == [0.1, 0.7, 0.1]
 
 
+def test_settings_have_two_names_in_a_param_space() -> None:
+    config = small_config("iddpg")
+    config.update_from_dict({"model_config": {"hidden_sizes": (8,)}, "on_episode_end": print})
+    assert config._model_config == {"hidden_sizes": (8,)} and config.callbacks_on_episode_end is print
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -357,8 +459,8 @@ def test_policies_differ_in_exploration_and_nothing_else(ray_session: None) -> N
 )
 def test_what_is_no_setting_or_no_legal_value_is_named(given: dict[str, Any], message: str) -> None:
     config = small_config("iddpg")
-    config.update_from_dict(given)
     with pytest.raises(ValueError, match=message):
+        config.update_from_dict(given)
         config.validate()
 
 
@@ -425,4 +527,33 @@ def test_a_checkpoint_of_other_networks_or_exploration_is_named(ray_session: Non
         other = small_config("iddpg").training(**settings_).build_algo()
         with pytest.raises(ValueError, match=f"was saved with other policies, networks.*{message}.*load_networks"):
             other.restore_from_path(path)
+        other.stop()
+
+
+def test_a_run_does_not_go_on_in_other_spaces(ray_session: None, tmp_path: Path, caplog: Any) -> None:
+    """The same output of an actor would be another action, in silence."""
+
+    def build(high: float = 1.0, size: int = 3) -> Any:
+        class Other(TwoAgents):
+            def __init__(self, config: dict[str, Any]) -> None:
+                super().__init__(config)
+                box = gym.spaces.Box(-high, high, (2,), np.float32)
+                self.action_spaces = dict.fromkeys(self.agents, box)
+                seen = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+                self.observation_spaces = dict.fromkeys(self.agents, seen)
+
+        return small_config("iddpg").environment(Other, env_config={}).build_algo()
+
+    algo = build()
+    path, state = algo.save_to_path(str(tmp_path)), algo.get_state()
+    algo.stop()
+    for spaces, message in (({"high": 2.0}, r"Box\(-2.0, 2.0.*in the saved run.*-1.0, 1.0"), ({"size": 4}, r"\(4,\)")):
+        other = build(**spaces)
+        for restore in (lambda other=other: other.restore_from_path(path), lambda other=other: other.set_state(state)):
+            with pytest.raises(ValueError, match=rf"^The spaces of agent '.*{message}.*load_networks"):
+                restore()
+        if "high" in spaces:
+            with caplog.at_level("WARNING", "rllib_maobs"):
+                maobs.load_networks(other, path)
+            assert "the same output is another action" in caplog.text
         other.stop()

@@ -53,6 +53,8 @@ def test_unknown_ids():
     for make in (make_vec, parallel_env, lambda name: MAObsEnv({"scenario": name})):
         with pytest.raises(ValueError, match=r"'spread-9' \(did you mean 'spread-9a'\?\); legal ids: .*spread-3a"):
             make("spread-9")
+    with pytest.raises(ValueError, match=r"must be a dict, such as .*, not 'spread-3a'"):
+        MAObsEnv("spread-3a")
     for config in ({}, None):
         with pytest.raises(ValueError, match='needs a "scenario"'):
             MAObsEnv(config)

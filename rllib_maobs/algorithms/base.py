@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
+from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,6 +32,7 @@ from ray.rllib.utils.metrics import (
     SYNCH_WORKER_WEIGHTS_TIMER,
     TIMERS,
 )
+from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
 from rllib_maobs.algorithms.checks import check_machine
 from rllib_maobs.algorithms.config import JointConfig
@@ -41,8 +43,10 @@ from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raise_kept, raised_as_themselves
 
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
-# Minibatches are drawn several at a time, up to this many rows: one gather instead of many.
+# Minibatches are drawn several at a time, up to this many rows: one gather instead of many. Those of long windows are
+# larger, so there are fewer.
 _ROWS_PER_DRAW = 16_384
+_LONG_WINDOW = 32
 
 
 class JointAlgorithm(AnyPath, Algorithm):
@@ -90,6 +94,7 @@ class JointAlgorithm(AnyPath, Algorithm):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
         self._rounds_without_samples = 0
+        self._custom_metrics: dict[str, Any] = {}
         self._progress: dict[str, Any] = {
             "env_steps": 0,
             "updates": 0,
@@ -145,9 +150,30 @@ class JointAlgorithm(AnyPath, Algorithm):
 
     @override(Algorithm)
     def evaluate(self, parallel_train_future: Any = None) -> Any:
-        """RLlib's evaluation; an error of a remote environment is raised as itself."""
+        """RLlib's evaluation; an error of a remote environment is raised as itself.
+
+        What `custom_evaluation_function` returns is part of the results. RLlib would report only what it logs.
+        """
+        self._custom_metrics = {}
         with raised_as_themselves(self.eval_env_runner_group):
-            return super().evaluate(parallel_train_future)
+            results = super().evaluate(parallel_train_future)
+        return {**results, **self._custom_metrics}
+
+    @override(Algorithm)
+    def _evaluate_with_custom_eval_function(self) -> tuple[dict[str, Any], int, int]:
+        returned = self.config.custom_evaluation_function(self, self.eval_env_runner_group)
+        try:
+            metrics, env_steps, agent_steps = returned
+            legal = isinstance(metrics, dict) and isinstance(env_steps, Integral) and isinstance(agent_steps, Integral)
+        except (TypeError, ValueError):
+            legal = False
+        if not legal:
+            raise ValueError(
+                f"custom_evaluation_function returns {returned!r}; legal are metrics (a dict), env steps and agent "
+                f"steps (integers)."
+            )
+        self._custom_metrics = MetricsLogger.peek_results(metrics)  # numbers, also of what runners give
+        return metrics, int(env_steps), int(agent_steps)
 
     def _check_reward(self, sample: JointSample) -> None:
         """Raises a ValueError where agents' rewards differ but the algorithm's value is that of a team reward."""
@@ -177,9 +203,10 @@ class JointAlgorithm(AnyPath, Algorithm):
         steps = self._progress["env_steps"] - self._progress["learning_starts"]
         owed = math.floor(self.config.updates_per_env_step * steps) - self._progress["updates"] if steps > 0 else 0
         batch_size = self.config.train_batch_size_per_learner
+        rows = batch_size * max(1, self.config.window_length // _LONG_WINDOW)
         left = owed
         while left > 0:
-            count = min(left, max(1, _ROWS_PER_DRAW // batch_size))
+            count = min(left, max(1, _ROWS_PER_DRAW // rows))
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
                 batch = self.replay_buffer.sample(
                     (count, batch_size),
@@ -212,22 +239,34 @@ class JointAlgorithm(AnyPath, Algorithm):
         if report is not None:
             self.metrics.aggregate([report], key=LEARNER_RESULTS)
 
-    def _follow(self, agents: Sequence[str] | None) -> None:
+    def _follow(self, saved: Team | None) -> None:
         """Builds everything anew if a saved team, whose state is to be taken over, stands in another order.
 
         Networks of a centralised critic have weights for every agent's place, so the order is taken over with them.
 
         Raises:
-            ValueError: If its agents are others.
+            ValueError: If its agents are others, observe something of another size, or act in other spaces: the same
+                output of an actor would be another action.
         """
         team: Team = self.config.team
-        if agents is None or tuple(agents) == team.agents:
+        if saved is None:
             return
+        agents = saved.agents
         if set(agents) != set(team.agents):
             raise ValueError(
                 f"The saved team is {sorted(agents)}, but the agents of {self.config.env!r} are "
                 f"{sorted(team.agents)}: a run goes on with the same set of agents only."
             )
+        for agent in agents:
+            (observed, acted), (observes, acts) = saved.spaces(agent), team.spaces(agent)
+            if observed.shape != observes.shape or acted != acts:
+                raise ValueError(
+                    f"The spaces of agent {agent!r} in {self.config.env!r} are {observes} and {acts}, but in the saved "
+                    f"run {observed} and {acted}: a run goes on with observations of the same size and the same "
+                    f"actions only. maobs.load_networks starts a new run from its networks, where they fit."
+                )
+        if agents == team.agents:
+            return
         config: JointConfig = self.config.copy(copy_frozen=False)
         config.team = team.ordered(agents)
         config.validate()
@@ -247,7 +286,7 @@ class JointAlgorithm(AnyPath, Algorithm):
             if files.get_file_info(saved).type == FileType.File:
                 with files.open_input_stream(saved) as file:
                     team = pickle.load(file)["ctor_args_and_kwargs"][0][0].get("team")
-                self._follow(None if team is None else team.agents)
+                self._follow(team)
         try:
             super().restore_from_path(path, *args, component=component, filesystem=filesystem, **kwargs)
         except (KeyError, IndexError, RuntimeError) as error:  # what RLlib and torch say of what does not fit
@@ -269,7 +308,7 @@ class JointAlgorithm(AnyPath, Algorithm):
         """RLlib's state, the progress of updates against steps and, if wanted, the replay buffer."""
         state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
         state["progress"] = dict(self._progress)
-        state["agents"] = list(self.config.team.agents)
+        state["team"] = self.config.team
         stored = self.config.store_buffer_in_checkpoints
         if stored and self._check_component(COMPONENT_REPLAY_BUFFER, components, not_components):
             state[COMPONENT_REPLAY_BUFFER] = self.replay_buffer.get_state()
@@ -278,7 +317,7 @@ class JointAlgorithm(AnyPath, Algorithm):
     @override(Algorithm)
     def set_state(self, state: dict[str, Any]) -> None:
         """Goes on from a saved state; without a saved replay buffer learning starts when it is refilled."""
-        self._follow(state.get("agents"))
+        self._follow(state.get("team"))
         if COMPONENT_METRICS_LOGGER in state:  # RLlib reads the runners' step count in it before it restores it
             self.metrics.set_state(state[COMPONENT_METRICS_LOGGER])
         super().set_state(state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shlex
 import shutil
@@ -11,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core import ALL_MODULES
 from ray.rllib.core.rl_module import RLModule, validate_module_id
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.policy.policy import PolicySpec
+from ray.rllib.utils import force_list
 
 from rllib_maobs.algorithms import settings
 from rllib_maobs.envs.team import Team, shares_reward
@@ -26,6 +28,7 @@ from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, EntityActor, Entit
 from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings, takes
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.options import closest
+from rllib_maobs.replay import memory_of
 from rllib_maobs.runner import JointEnvRunner, make_env
 
 if TYPE_CHECKING:
@@ -42,6 +45,19 @@ def one_of(name: str, value: Any, legal: Collection[str]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, legal))}, not {value!r}.")
 
 
+def check_call(name: str, function: Any, *arguments: Any) -> None:
+    """Raises a ValueError unless a function takes such arguments."""
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        given = ", ".join(type(argument).__name__ for argument in arguments)
+        raise ValueError(
+            f"{name} can't be called as RLlib does, with {len(arguments)} arguments ({given}): {error}."
+        ) from None
+    except ValueError:  # it has no signature
+        pass
+
+
 def own_policy(agent_id: str, episode: Any = None, **kwargs: Any) -> str:
     """The default policy mapping: every agent has a policy of its own, named like it."""
     return agent_id
@@ -55,12 +71,19 @@ def check_settings_of(config: JointConfig) -> None:
     for name in ("exploration", "actor_settings", "critic_settings"):
         if not isinstance(getattr(config, name), dict):
             raise ValueError(f"{name} must be a dict of settings by name, not {getattr(config, name)!r}.")
-    for name in ("train_batch_size_per_learner", "num_steps_sampled_before_learning_starts", "seq_length"):
+    for name in ("train_batch_size_per_learner", "num_steps_sampled_before_learning_starts", "seq_length", "n_step"):
         if getattr(config, name) > config.replay_buffer_capacity:
             raise ValueError(
                 f"{name} ({getattr(config, name)}) must not be larger than "
                 f"replay_buffer_capacity ({config.replay_buffer_capacity})."
             )
+    steps = config.num_envs_per_env_runner * config.get_rollout_fragment_length()
+    if steps > config.replay_buffer_capacity and not config.in_evaluation:
+        raise ValueError(
+            f"num_envs_per_env_runner ({config.num_envs_per_env_runner}) times rollout_fragment_length "
+            f"({config.get_rollout_fragment_length()}) must not be larger than replay_buffer_capacity "
+            f"({config.replay_buffer_capacity}): replay takes so many steps at once."
+        )
     if not config.supports.twin_critics and (config.twin_critics or config.target_noise or config.policy_delay > 1):
         legal = "twin_critics=False, target_noise=0.0 and policy_delay=1"
         raise ValueError(f"{config.name} is not defined with TD3's options; legal are {legal}.")
@@ -68,9 +91,17 @@ def check_settings_of(config: JointConfig) -> None:
         raise ValueError(f"env_runner_cls must be a JointEnvRunner, not {config.env_runner_cls}: replay is joint.")
     if not issubclass(config.learner_class, JointLearner):
         raise ValueError(f"learner_class must be a JointLearner, not {config.learner_class}: its losses are joint.")
+    for callback in force_list(config.callbacks_class):
+        if not callable(callback) or (isinstance(callback, type) and not issubclass(callback, RLlibCallback)):
+            raise ValueError(
+                f"callbacks_class must be a subclass of RLlibCallback, or a list of them, not {callback!r}."
+            )
+    for name in settings.CALLBACKS:
+        if wrong := [function for function in force_list(getattr(config, name)) if not callable(function)]:
+            raise ValueError(f"{name} must be a function, or a list of functions, not {wrong[0]!r}.")
     settings.check_known(config)
     if not config.in_evaluation:
-        settings.check_known(config.get_evaluation_config_object())
+        settings.check_evaluation(config)
 
 
 def check_networks(config: JointConfig) -> None:
@@ -206,7 +237,10 @@ def map_policies(config: JointConfig) -> tuple[str, ...]:
                 f"policies may differ in exploration, by multi_agent(algorithm_config_overrides_per_module=...), and "
                 f"in networks, by rl_module(rl_module_spec=...)."
             )
+    check_call("policy_mapping_fn", config.policy_mapping_fn, team.agents[0], None)
     module_ids = tuple(config.policy_mapping_fn(agent, None) for agent in team.agents)
+    if unnamed := [mid for mid in module_ids if not isinstance(mid, str)]:
+        raise ValueError(f"policy_mapping_fn must return names of policies (strings), not {unnamed[0]!r}.")
     mapping = dict(zip(team.agents, module_ids, strict=True))
     if set(module_ids) != set(config.policies):
         raise ValueError(
@@ -291,12 +325,21 @@ def built_modules(config: JointConfig) -> dict[str, RLModule]:
         return {mid: spec.build() for mid, spec in specs.items()}
 
 
-def check_machine(config: AlgorithmConfig) -> None:
+def check_machine(config: JointConfig) -> None:
     """Checks that the machine of the learner has what the configuration asks for; the others need not."""
     if config.num_gpus_per_learner > 0 and not torch.cuda.is_available():
         raise ValueError(
             f"num_gpus_per_learner must be 0 where PyTorch finds no GPU, not {config.num_gpus_per_learner}: "
             f"torch.cuda.is_available() is False."
+        )
+    team: Team = config.team
+    observations = config.train_batch_size_per_learner * max(1, config.window_length)
+    size = 8 * observations * len(team.agents) * team.observation_size  # now and next, in single precision
+    if size > (memory := memory_of("cuda" if config.num_gpus_per_learner > 0 else "cpu")):
+        raise ValueError(
+            f"A minibatch takes {size / 1e9:,.1f} GB, and there are {memory / 1e9:,.1f} GB: lower "
+            f"train_batch_size_per_learner ({config.train_batch_size_per_learner}) or seq_length "
+            f"({config.seq_length}, with recurrent actors)."
         )
     if config.torch_compile_learner and config.torch_compile_learner_dynamo_backend == "inductor":
         check_compiler()

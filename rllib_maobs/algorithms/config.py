@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Literal, Self
 
@@ -39,6 +40,16 @@ class Supports:
     recurrent: bool = True
     parameter_sharing: bool = True
     twin_critics: bool = True
+
+
+def _checked(method: Callable[..., Any]) -> Callable[..., Any]:
+    """One of RLlib's methods, which checks the values that it is given, and takes NumPy's numbers."""
+
+    @functools.wraps(method)
+    def checked(self: JointConfig, *args: Any, **kwargs: Any) -> Any:
+        return method(self, *args, **settings.checked(self, kwargs))
+
+    return checked
 
 
 class JointConfig(AlgorithmConfig):
@@ -217,7 +228,7 @@ class JointConfig(AlgorithmConfig):
         if "carry_hidden" in kwargs:
             raise ValueError("carry_hidden is now called stored_state (Kapturowski et al. 2019's term).")
         settings.check_arguments(self, kwargs)
-        super().training(**kwargs)
+        super().training(**settings.checked(self, kwargs))
         given = {k: v for k, v in locals().items() if k not in ("self", "kwargs", "__class__")}
         for name, value in given.items():
             if value is not NotProvided:
@@ -225,10 +236,17 @@ class JointConfig(AlgorithmConfig):
         return self
 
     @override(AlgorithmConfig)
-    def env_runners(self, **kwargs: Any) -> Self:
-        """RLlib's, which would not take NumPy's numbers."""
-        super().env_runners(**{name: settings.plain(value) for name, value in kwargs.items()})
+    def update_from_dict(self, config_dict: dict[str, Any]) -> Self:
+        """Changes settings, e.g. by Tune's `param_space`, whichever of their names in RLlib they are given by."""
+        super().update_from_dict(settings.as_attributes(config_dict))
         return self
+
+    # RLlib's methods that calculate with what they are given.
+    environment = _checked(AlgorithmConfig.environment)
+    env_runners = _checked(AlgorithmConfig.env_runners)
+    learners = _checked(AlgorithmConfig.learners)
+    evaluation = _checked(AlgorithmConfig.evaluation)
+    multi_agent = _checked(AlgorithmConfig.multi_agent)
 
     @override(AlgorithmConfig)
     def validate(self) -> None:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from ray.rllib.algorithms.algorithm_config import DEPRECATED_VALUE, AlgorithmConfig
+from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
 from rllib_maobs.options import Range, check_value, closest
 from rllib_maobs.registry import same
@@ -20,28 +22,27 @@ PositiveInt = Annotated[int, Range(1)]
 NonNegativeInt = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0.0, exclusive=True)]
 NonNegative = Annotated[float, Range(0.0)]
+Amount = NonNegativeInt | NonNegative  # of a resource: a whole number stays one
+
+CALLBACKS = tuple(
+    f"callbacks_{name}"
+    for name in (
+        "on_algorithm_init on_train_result on_evaluate_start on_evaluate_end on_env_runners_recreated "
+        "on_checkpoint_loaded on_environment_created on_episode_created on_episode_start on_episode_step "
+        "on_episode_end on_sample_end"
+    ).split()
+)
+"""Settings that are functions to be called."""
 
 LEGAL: dict[str, Any] = {
+    # Ours.
     "actor_lr": Positive | list,
     "critic_lr": Positive | list,
-    "gamma": Annotated[float, Range(0.0, 1.0)],
     "tau": Annotated[float, Range(0.0, 1.0, exclusive=True)],
-    "train_batch_size_per_learner": PositiveInt,
     "replay_buffer_capacity": PositiveInt,
-    "num_env_runners": NonNegativeInt,
-    "num_envs_per_env_runner": PositiveInt,
-    "rollout_fragment_length": PositiveInt | Literal["auto"],
-    "evaluation_duration_unit": Literal["episodes", "timesteps"],
-    "num_gpus_per_learner": NonNegativeInt | NonNegative,
-    "metrics_num_episodes_for_smoothing": PositiveInt,
-    "seed": NonNegativeInt | None,
-    "explore": bool,
-    "torch_compile_learner": bool,
-    "evaluation_interval": NonNegativeInt | None,
-    "sample_timeout_s": Positive | None,
-    "min_sample_timesteps_per_iteration": NonNegativeInt | None,
     "updates_per_env_step": NonNegative,
     "critic_state": Literal["observations", "world"],
+    "observation_layouts": Mapping | None,
     "seq_length": PositiveInt,
     "stored_state": bool,
     "n_step": PositiveInt,
@@ -54,10 +55,73 @@ LEGAL: dict[str, Any] = {
     "normalize_observations": bool,
     "reward_scale": Positive,
     "agent_id_input": bool,
-    "grad_clip": Positive | None,
     "num_random_steps": NonNegativeInt,
     "num_steps_sampled_before_learning_starts": NonNegativeInt,
     "store_buffer_in_checkpoints": bool,
+    # RLlib's, in the order of `METHODS`.
+    "num_cpus_for_main_process": Amount,
+    "custom_resources_for_main_process": dict,
+    "placement_strategy": Literal["PACK", "SPREAD", "STRICT_PACK", "STRICT_SPREAD"],
+    "torch_compile_learner": bool,
+    "torch_compile_learner_dynamo_backend": str,
+    "torch_compile_learner_dynamo_mode": str | None,
+    "env": str | type | None,
+    "env_config": dict,
+    "env_runner_cls": type,
+    "num_env_runners": NonNegativeInt,
+    "num_envs_per_env_runner": PositiveInt,
+    "create_env_on_local_worker": bool,
+    "num_cpus_per_env_runner": Amount,
+    "custom_resources_per_env_runner": dict,
+    "validate_env_runners_after_construction": bool,
+    "sample_timeout_s": Positive | None,
+    "max_requests_in_flight_per_env_runner": PositiveInt,
+    "rollout_fragment_length": PositiveInt | Literal["auto"],
+    "explore": bool,
+    "num_cpus_per_learner": Amount | Literal["auto"],
+    "num_gpus_per_learner": Amount,
+    "local_gpu_idx": NonNegativeInt,
+    "learner_class": type | None,
+    "learner_config_dict": dict,
+    "gamma": Annotated[float, Range(0.0, 1.0)],
+    "train_batch_size_per_learner": PositiveInt,
+    "grad_clip": Positive | None,
+    "grad_clip_by": Literal["global_norm", "norm", "value"],
+    "callbacks_class": Callable | list | tuple,
+    **dict.fromkeys(CALLBACKS, Callable | list | tuple | None),
+    "evaluation_interval": NonNegativeInt | None,
+    "evaluation_duration": PositiveInt | Literal["auto"],
+    "evaluation_duration_unit": Literal["episodes", "timesteps"],
+    "evaluation_config": dict | None,
+    "evaluation_auto_duration_min_env_steps_per_sample": PositiveInt,
+    "evaluation_auto_duration_max_env_steps_per_sample": PositiveInt,
+    "evaluation_sample_timeout_s": Positive | None,
+    "evaluation_num_env_runners": NonNegativeInt,
+    "evaluation_unhealthy_workers_timeout_s": NonNegative,
+    "evaluation_parallel_to_training": bool,
+    "evaluation_error_after_n_consecutive_skips": PositiveInt | None,
+    "evaluation_force_reset_envs_before_iteration": bool,
+    "custom_evaluation_function": Callable | None,
+    "policies": dict | set | list | tuple,
+    "policy_mapping_fn": Callable,
+    "rl_module_spec": RLModuleSpec | MultiRLModuleSpec | None,
+    "algorithm_config_overrides_per_module": dict,
+    "metrics_num_episodes_for_smoothing": PositiveInt,
+    "min_time_s_per_iteration": NonNegative | None,
+    "min_train_timesteps_per_iteration": NonNegativeInt | None,
+    "min_sample_timesteps_per_iteration": NonNegativeInt | None,
+    "custom_stats_cls_lookup": dict,
+    "log_level": Literal["DEBUG", "INFO", "WARN", "WARNING", "ERROR"],
+    "seed": Annotated[int, Range(0, 2**32 - 1)] | None,
+    "restart_failed_env_runners": bool,
+    "restart_failed_sub_environments": bool,
+    "ignore_env_runner_failures": bool,
+    "max_num_env_runner_restarts": NonNegativeInt,
+    "delay_between_env_runner_restarts_s": NonNegative,
+    "num_consecutive_env_runner_failures_tolerance": NonNegativeInt,
+    "env_runner_health_probe_timeout_s": Positive,
+    "env_runner_restore_timeout_s": Positive,
+    "_validate_config": bool,
 }
 """What is legal for each setting of every algorithm, as a type hint."""
 
@@ -92,12 +156,18 @@ HONOURED: dict[str, str] = {
     **_each("on_env_runners_recreated on_checkpoint_loaded on_environment_created on_sample_end"),
     **_each("on_episode_created on_episode_start on_episode_step on_episode_end"),
     # evaluation
-    **_each("evaluation_interval evaluation_duration evaluation_duration_unit evaluation_config"),
+    **_each("evaluation_interval evaluation_duration evaluation_duration_unit"),
+    **_each(
+        "evaluation_config", "settings of the runners that evaluate; others would do nothing there, and are errors"
+    ),
     **_each("evaluation_auto_duration_min_env_steps_per_sample evaluation_auto_duration_max_env_steps_per_sample"),
     **_each("evaluation_sample_timeout_s evaluation_num_env_runners evaluation_unhealthy_workers_timeout_s"),
     **_each("evaluation_parallel_to_training", "needs evaluation_num_env_runners"),
     **_each("evaluation_error_after_n_consecutive_skips evaluation_force_reset_envs_before_iteration"),
-    **_each("custom_evaluation_function"),
+    **_each(
+        "custom_evaluation_function",
+        "the metrics that it returns are results; on_evaluate_end sees those alone that it logs in algo.metrics",
+    ),
     # multi_agent, rl_module
     **_each("policies policy_mapping_fn", "agents of one policy share its networks"),
     **_each("model_config", "hidden_sizes, activation and lstm_cell_size, where a network takes them"),
@@ -259,6 +329,26 @@ REFUSED: dict[str, str] = {
 }
 """Settings of RLlib that are errors when set away from their defaults, and what to use instead."""
 
+IN_EVALUATION: frozenset[str] = frozenset(
+    "env env_config explore exploration algorithm_config_overrides_per_module seed env_runner_cls "
+    "num_envs_per_env_runner create_env_on_local_worker num_cpus_per_env_runner custom_resources_per_env_runner "
+    "validate_env_runners_after_construction max_requests_in_flight_per_env_runner callbacks_class "
+    "on_environment_created on_episode_created on_episode_start on_episode_step on_episode_end on_sample_end "
+    "metrics_num_episodes_for_smoothing custom_stats_cls_lookup restart_failed_env_runners "
+    "restart_failed_sub_environments ignore_env_runner_failures max_num_env_runner_restarts "
+    "delay_between_env_runner_restarts_s num_consecutive_env_runner_failures_tolerance "
+    "env_runner_health_probe_timeout_s".split()
+)
+"""Settings that do something in `evaluation_config`: those of the runners which evaluate."""
+
+_NOT_IN_EVALUATION = {
+    "num_env_runners": "use evaluation(evaluation_num_env_runners=...)",
+    "rollout_fragment_length": "use evaluation(evaluation_duration=...)",
+    "sample_timeout_s": "use evaluation(evaluation_sample_timeout_s=...)",
+    "on_evaluate_start": "use callbacks(on_evaluate_start=...)",
+    "on_evaluate_end": "use callbacks(on_evaluate_end=...)",
+}
+
 METHODS = (
     "python_environment resources framework api_stack environment env_runners learners training callbacks evaluation "
     "offline_data multi_agent reporting checkpointing debugging fault_tolerance rl_module experimental"
@@ -284,6 +374,12 @@ _ATTRIBUTES = {
 def attribute_of(name: str) -> str:
     """The attribute of an `AlgorithmConfig` that holds a setting."""
     return f"callbacks_{name}" if name.startswith("on_") else _ATTRIBUTES.get(name, name)
+
+
+def as_attributes(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by the names of RLlib's attributes, where they are given by those of its arguments."""
+    known = {*HONOURED, *HARMLESS, *REFUSED}
+    return {attribute_of(name) if name in known else name: value for name, value in given.items()}
 
 
 def settings_of_method(method: str) -> list[str]:
@@ -331,6 +427,19 @@ def plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+def checked(config: JointConfig, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What one of RLlib's methods is given, checked before RLlib calculates with it, and plain.
+
+    Raises:
+        ValueError: If a value is not legal; says what is.
+    """
+    owner = type(config).__name__
+    return {
+        name: check_value(plain(value), config.legal[name], name, owner) if name in config.legal else plain(value)
+        for name, value in given.items()
+    }
+
+
 def check_values(config: JointConfig) -> None:
     """Checks each setting by itself, and makes NumPy's scalars the numbers that they are.
 
@@ -341,7 +450,8 @@ def check_values(config: JointConfig) -> None:
         if isinstance(value, np.generic):
             setattr(config, name, plain(value))
     for name, hint in config.legal.items():
-        setattr(config, name, check_value(getattr(config, name), hint, name, type(config).__name__))
+        attribute = _ATTRIBUTES.get(name, name)
+        setattr(config, attribute, check_value(getattr(config, attribute), hint, name, type(config).__name__))
     for name in ("actor_lr", "critic_lr"):
         check_schedule(name, getattr(config, name, 0.0))
 
@@ -399,6 +509,26 @@ def unknown(config: JointConfig, name: str) -> str:
     legal = [legal for legal in (*vars(type(config)()), *config.legal) if legal[0] != "_"]
     hint = f"; it is one of {', '.join(owners)}" if owners else closest(name, legal)
     return f"{type(config).__name__} has no setting {name!r}{hint}."
+
+
+def check_evaluation(config: JointConfig) -> None:
+    """Checks the settings that evaluation is to have otherwise than training.
+
+    Raises:
+        ValueError: If one of them is unknown, or not legal, or would do nothing there.
+    """
+    evaluation: JointConfig = config.get_evaluation_config_object()
+    check_values(evaluation)
+    check_known(evaluation)
+    legal = {attribute_of(name) for name in (*IN_EVALUATION, *HARMLESS)}
+    for name, value in as_attributes(config.evaluation_config or {}).items():
+        if name not in legal and not same(value, getattr(config, name, None)):
+            setting = name.removeprefix("callbacks_")
+            instead = _NOT_IN_EVALUATION.get(setting, "evaluation has its runners' settings alone for itself")
+            raise ValueError(
+                f"evaluation_config sets {setting}={value!r}, which has no effect there: {instead}; legal are "
+                f"{', '.join(sorted(IN_EVALUATION))}."
+            )
 
 
 def check_arguments(config: JointConfig, given: Mapping[str, Any]) -> None:

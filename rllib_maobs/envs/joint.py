@@ -7,7 +7,7 @@ environment lists its agents.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from inspect import signature
@@ -22,7 +22,7 @@ from ray.tune.registry import register_env
 
 from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
-from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
+from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult, layouts_of
 from rllib_maobs.layout import Entities, Layout, flat
 
 
@@ -111,7 +111,7 @@ class WithAgentIds:
         layouts: dict[str, Groups] = {
             agent: flat(flatdim(env.observation_spaces[agent]), "observation") for agent in self.observation_spaces
         }
-        known: Mapping[str, Groups | None] = getattr(env, "observation_layouts", None) or {}
+        known = layouts_of(env)
         layouts.update({agent: layout for agent, layout in known.items() if layout is not None})
         self.observation_layouts = {agent: (*self.id_layout, *layout) for agent, layout in layouts.items()}
         self.state_layout: Groups | None = getattr(env, "state_layout", None)
@@ -178,6 +178,16 @@ def make_joint_env(creator: Callable[[Any], Any], context: Mapping[str, Any], nu
         ValueError: If what the creator returns is not a multi-agent environment with a list of agents, or the same
             object twice.
     """
+    try:
+        signature(creator).bind(context)
+    except TypeError as error:
+        name = getattr(creator, "__name__", creator)
+        raise ValueError(
+            f"{name} can't be called with env_config ({error}): legal is a class whose constructor takes it, or what "
+            f'tune.register_env("my_env", lambda config: {name}()) has registered.'
+        ) from None
+    except ValueError:  # it has no signature
+        pass
     env = creator(_own_context(context, 0))
     if hasattr(env, "make_vec"):
         joint: JointEnv = env.make_vec(num_envs)
@@ -250,7 +260,8 @@ class StackedEnv:
                 f"{self._name} is an AEC environment, whose agents act in turns; legal are RLlib MultiAgentEnvs and "
                 f"PettingZoo ParallelEnvs: use its parallel_env(), or pettingzoo.utils.aec_to_parallel(env)."
             )
-        self.agents: list[str] = list(getattr(env, "possible_agents", None) or [])
+        agents = getattr(env, "possible_agents", None)
+        self.agents: list[str] = list(agents) if isinstance(agents, Iterable) else []
         if not self.agents:
             raise ValueError(
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
@@ -292,10 +303,22 @@ class StackedEnv:
 
     def _spaces(self, env: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         """Each agent's spaces of observations and of actions."""
-        observation, action = (
-            getattr(env, f"get_{which}", None) or getattr(env, which) for which in ("observation_space", "action_space")
-        )
-        return {agent: observation(agent) for agent in self.agents}, {agent: action(agent) for agent in self.agents}
+        spaces: list[dict[str, Any]] = []
+        for which in ("observation_space", "action_space"):
+            try:
+                space_of = getattr(env, f"get_{which}", None) or getattr(env, which)
+                spaces.append({agent: space_of(agent) for agent in self.agents})
+            except (AttributeError, LookupError, TypeError) as error:
+                raise ValueError(
+                    f"{self._name} has no {which} for each of {self.agents} ({type(error).__name__}: {error}); legal "
+                    f"are a method {which}(agent), or RLlib's dict {which}s."
+                ) from error
+            if unknown := [agent for agent, space in spaces[-1].items() if not isinstance(space, gym.Space)]:
+                raise ValueError(
+                    f"{self._name}: {which} of agent {unknown[0]!r} is {spaces[-1][unknown[0]]!r}; legal is a space of "
+                    f"gymnasium."
+                )
+        return spaces[0], spaces[1]
 
     def reset(self, seed: int | Sequence[int] | None = None, mask: Bool | None = None) -> tuple[Float, dict[str, Any]]:
         """Resets all copies, or those where `mask` is true; returns all observations `(E, N, O)`.
@@ -312,7 +335,7 @@ class StackedEnv:
             result = self._envs[copy].reset(seed=None if seed is None else seed[copy])
             if not _are(result, (Mapping, Mapping | None)):
                 raise self._error(copy, f"reset() returns {_kinds(result)}", "two dicts by agent: observations, infos")
-            self._infos[copy] = result[1] or {}
+            self._infos[copy] = self._infos_of(result[1], copy)
             rows = self._stack(result[0], copy)
             if self._obs is None:
                 self._obs = np.zeros((self.num_envs, *rows.shape), dtype=np.float32)
@@ -352,15 +375,14 @@ class StackedEnv:
                 legal = "five dicts by agent: observations, rewards, terminated, truncated, infos"
                 raise self._error(copy, f"step() returns {_kinds(result)}", legal)
             obs, reward, terminations, truncations, infos = result
-            self._infos[copy] = infos = infos or {}
+            self._infos[copy] = infos = self._infos_of(infos, copy)
             self._obs[copy] = self._stack(obs, copy)
             rewards[copy] = self._rewards(reward, copy)
             over = self._flags(terminations, truncations, copy)
             if over is not None:
                 terminated[copy] = over
                 truncated[copy] = not over.all()
-                info = infos.get(self.agents[0]) or {}  # None is taken as empty: it says nothing
-                for name, value in info.get("episode_metrics", {}).items():
+                for name, value in self._metrics_of(infos, copy).items():
                     metrics.setdefault(name, np.full(self.num_envs, np.nan, dtype=np.float32))[copy] = value
         return (
             self._obs.copy(),
@@ -378,7 +400,9 @@ class StackedEnv:
         """Which agents terminated `(N,)` if the episode is over (the others were truncated), or None if it goes on."""
         for flags in (terminations, truncations):
             for name, flag in flags.items():
-                if name not in self._flagged or not isinstance(flag, bool | np.bool_ | int | np.integer | None):
+                if name not in self._flagged or not (
+                    flag is None or (isinstance(flag, bool | np.bool_ | int | np.integer) and flag in (0, 1))
+                ):
                     legal = "True or False for each agent, and for '__all__'"
                     raise self._error(copy, f"the termination or truncation of {name!r} is {flag!r}", legal)
         terminated, truncated = (
@@ -393,18 +417,43 @@ class StackedEnv:
             raise self._error(copy, f"the team changed: {gone} ended, others go on", "agents that end in the same step")
         return None
 
+    def _infos_of(self, infos: Mapping[str, Any] | None, copy: int) -> Mapping[str, Any]:
+        """Infos by agent; None is taken as empty: it says nothing."""
+        for agent, info in (infos or {}).items():
+            if not isinstance(info, Mapping | None):
+                raise self._error(copy, f"the info of {agent!r} is {info!r}", "a dict, or None")
+        return infos or {}
+
+    def _metrics_of(self, infos: Mapping[str, Any], copy: int) -> dict[str, float]:
+        """What an episode's last infos say of it under "episode_metrics", whichever agent's have it."""
+        metrics: dict[str, float] = {}
+        for agent, info in infos.items():
+            given = (info or {}).get("episode_metrics") or {}
+            try:
+                metrics |= {name: float(_numbers(value).item()) for name, value in given.items()}
+            except (AttributeError, TypeError, ValueError):
+                what = f"episode_metrics in the info of {agent!r} are {given!r}"
+                raise self._error(copy, what, "a dict of single numbers by name") from None
+        return metrics
+
     def _rewards(self, reward: Mapping[str, Any], copy: int) -> list[float]:
         """Every agent's reward."""
+        if unknown := reward.keys() - self._flagged:
+            raise self._error(copy, f"there are rewards of {sorted(map(str, unknown))}", f"those of {self.agents}")
         row = []
         for agent in self.agents:
             value: Any = reward.get(agent, "missing")
-            try:
-                if np.ndim(value):
-                    raise TypeError
-                row.append(float(value))
-            except (TypeError, ValueError):
-                what = f"the reward of agent {agent!r} is {value!r}"
-                raise self._error(copy, what, "one number for each agent") from None
+            if type(value) is not float:  # the rest need a closer look
+                try:
+                    array = np.asarray(value)
+                except (ValueError, RuntimeError):  # lists of unequal lengths, tensors with gradients
+                    array = np.array(None)
+                # True is none either: flags in the place of rewards would be believed.
+                if array.ndim or array.dtype.kind not in "iuf":
+                    what = f"the reward of agent {agent!r} is {value!r}"
+                    raise self._error(copy, what, "one number for each agent")
+                value = float(array)
+            row.append(value)
         return row
 
     def _stack(self, obs: Mapping[str, Any], copy: int) -> Float:
@@ -418,8 +467,8 @@ class StackedEnv:
         rows = np.zeros((len(self.agents), self._size), dtype=np.float32)
         for row, agent in zip(rows, self.agents, strict=True):
             try:
-                own = np.asarray(obs[agent], dtype=np.float32).reshape(-1)
-            except (TypeError, ValueError) as error:
+                own = _numbers(obs[agent])
+            except (TypeError, ValueError, RuntimeError) as error:  # the last one is of tensors with gradients
                 what = f"the observation of agent {agent!r} is no array of numbers ({error})"
                 raise self._error(copy, what, f"what is in its space {self.observation_spaces[agent]}") from None
             if own.size != self._sizes[agent]:
@@ -453,7 +502,7 @@ class StackedEnv:
             except TypeError as error:
                 raise self._error(copy, f"state() cannot be called: {error}", "a method without arguments") from error
             try:
-                row = np.asarray(found, dtype=np.float32).reshape(-1)
+                row = _numbers(found)
             except (TypeError, ValueError) as error:
                 raise self._error(copy, f"the state is a {type(found).__name__}", "an array of numbers") from error
             self._state_size = self._state_size or row.size
@@ -470,6 +519,15 @@ class StackedEnv:
         for env in self._envs:
             _stepped.pop(id(_innermost(env)), None)
             env.close()
+
+
+def _numbers(values: Any) -> Float:
+    """Values as a vector; raises a TypeError if they are no numbers, such as strings that look like some."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"values of dtype {array.dtype}")
+    with np.errstate(over="ignore"):  # what is too large for single precision is not finite, and an error as such
+        return array.astype(np.float32).reshape(-1)
 
 
 def _are(result: Any, kinds: Sequence[Any]) -> bool:

@@ -44,6 +44,8 @@ class MAObsEnv(MultiAgentEnv):
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
+        if not isinstance(config, Mapping | None):
+            raise ValueError(f'the env config must be a dict, such as {{"scenario": "spread-9a"}}, not {config!r}')
         options = dict(config or {})
         if "scenario" not in options:
             raise ValueError('the env config needs a "scenario", such as {"scenario": "spread-9a"}')

@@ -185,10 +185,11 @@ class Team:
                 )
         actions = tuple(env.action_spaces[agent] for agent in agents)
         for agent, space in zip(agents, actions, strict=True):
-            box = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-            if not box and not isinstance(space, gym.spaces.Discrete):
+            box = isinstance(space, gym.spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0
+            if not (box and space.dtype.kind in "iuf") and not isinstance(space, gym.spaces.Discrete):
                 raise ValueError(
-                    f"The action space of agent {agent!r} is {space}; legal are Box of one dimension and Discrete."
+                    f"The action space of agent {agent!r} is {space}; legal are Box of one dimension, of integers or "
+                    f"floats, and Discrete."
                 )
             if type(space) is not type(actions[0]):
                 raise ValueError(
@@ -201,9 +202,10 @@ class Team:
                     f"to scale to, whose distance is finite in their type (of integers, bounds within 2**53)."
                 )
         observations = tuple(env.observation_spaces[agent] for agent in agents)
-        layouts: dict[str, Groups | None] = dict(getattr(env, "observation_layouts", None) or {})
+        layouts: dict[str, Groups | None] = dict(layouts_of(env))
         ids: Layout = getattr(env, "id_layout", ())
-        layouts.update({agent: (*ids, *own) for agent, own in (observation_layouts or {}).items()})
+        for agent, own in (observation_layouts or {}).items():
+            layouts[agent] = (*ids, *own) if isinstance(own, Iterable) else own
         if unknown := [agent for agent in layouts if agent not in agents]:
             raise ValueError(f"There are observation layouts of {unknown}; legal are those of the agents {[*agents]}.")
         return cls(
@@ -216,6 +218,14 @@ class Team:
             ),
             _state_layout(env, state_layout) if with_state else None,
         )
+
+
+def layouts_of(env: Any) -> Mapping[str, Groups | None]:
+    """What an environment says its observations are made of, by agent; empty if it does not say."""
+    layouts = getattr(env, "observation_layouts", None) or {}
+    if not isinstance(layouts, Mapping):
+        raise ValueError(f"An environment's observation_layouts must be a dict by agent, not {layouts!r}.")
+    return layouts
 
 
 def _by_name(agent: str) -> tuple[list[str | int], str]:

@@ -58,6 +58,8 @@ def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
 
 
 def _absolute(path: str) -> str:
+    if not path:  # it would be the present folder
+        raise argparse.ArgumentTypeError("an empty path; give the folder of a checkpoint, or of a trial")
     return str(Path(path).expanduser().resolve())
 
 

@@ -94,6 +94,8 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If one is unknown or illegal; names the legal ones.
     """
+    if not isinstance(row, Mapping):
+        raise ValueError(f"Row {name!r}: {row!r} is illegal; legal: a mapping of settings.")
     if name != file_name(name):
         raise ValueError(
             f"Row {name!r}: folders of trials are named after it; legal are letters, digits and . _ + - (no dot first)."

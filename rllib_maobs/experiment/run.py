@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import ray
 from ray import tune
@@ -30,6 +30,18 @@ from rllib_maobs.experiment.resume import Grid, forget_decisions
 from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
+from rllib_maobs.options import Range, check_value
+
+_LEGAL: dict[str, Any] = {
+    "name": str,
+    "env": str,
+    "algorithms": list | tuple,
+    "training": Mapping,
+    "variants": Mapping,
+    "env_config": Mapping,
+    "stop_timesteps": Annotated[int, Range(1)],
+    "quick_algorithms": list | tuple,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +113,17 @@ class Experiment:
     quick_algorithms: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        for name, hint in _LEGAL.items():
+            check_value(getattr(self, name), hint, name, "Experiment")
+        if not self.name or Path(self.name).name != self.name:
+            raise ValueError(f"Experiment: name={self.name!r} is illegal; legal is a name of a folder.")
+        if len(set(self.algorithms)) < max(1, len(self.algorithms)):
+            raise ValueError(f"Experiment: algorithms={self.algorithms} are illegal; legal are one or more, once each.")
+        if unused := [name for name in self.variants if name not in self.algorithms]:
+            raise ValueError(
+                f"Experiment: variants {', '.join(map(repr, unused))} are not among the algorithms "
+                f"{', '.join(self.algorithms)}, so they would not be trained."
+            )
         for name in self.algorithms:
             check_row(name, self.variants.get(name, {"algorithm": name}))
         if unknown := [repr(name) for name in self.quick_algorithms if name not in self.algorithms]:

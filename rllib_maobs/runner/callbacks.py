@@ -36,6 +36,11 @@ class Callbacks:
     def __init__(self, runner: JointEnvRunner) -> None:
         self._runner = runner
         self._objects = [cls() for cls in force_list(runner.config.callbacks_class)]
+        for made in self._objects:
+            if not isinstance(made, RLlibCallback):
+                raise ValueError(
+                    f"callbacks_class makes a {type(made).__name__}; legal is a subclass of RLlibCallback."
+                )
         self._wanted = {name for name in _OF_A_RUNNER if self._overridden(name)}
 
     def _overridden(self, name: str) -> bool:

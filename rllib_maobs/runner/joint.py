@@ -368,12 +368,17 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             seen["recurrent_state"] = recurrent_state
         return seen
 
+    @property
+    def _lengths(self) -> NDArray[np.int64]:
+        """Steps that each copy's episode has taken so far, `(E,)`."""
+        return self._episodes.lengths
+
     def _check_finite(self, what: str, values: NDArray[np.float32]) -> None:
         if np.isfinite(values).all():
             return
         copy, agent = np.argwhere(~np.isfinite(values))[0][:2]
         raise ValueError(
-            f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._episodes.lengths[copy]} "
+            f"The {what} of agent {self.team.agents[agent]!r} is not finite at step {self._lengths[copy]} "
             f"of its episode in environment copy {copy} of {self.config.env} (runner {self.worker_index}): "
             f"{values[copy, agent]}; legal: finite numbers."
         )
