@@ -1,9 +1,9 @@
-"""What an update does with gradients: clipping and Adam; and how their computation is compiled."""
+"""What an update does with gradients: clipping and Adam; and how their computation is recorded or compiled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -11,6 +11,9 @@ import torch
 from torch import Tensor
 
 from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.tracing import traced
+
+_RECORDED_AT = 100  # calls; recording one takes as long as some hundred of them
 
 
 @contextmanager
@@ -111,6 +114,27 @@ def clipped(gradient: Params, limit: float | None, by: str) -> Params:
         name: g * (limit / squares[name].sqrt().clamp(min=limit)).view(-1, *[1] * (g.dim() - 1))
         for name, g in gradient.items()
     }
+
+
+class Recorded:
+    """A method that runs as it is for some calls, and whose tensor operations are then recorded and played back.
+
+    The numbers are the same bit for bit, see `traced`. What can't be recorded goes on as it is.
+
+    Args:
+        method: The method. Its arguments may change in nothing but the numbers in their tensors.
+    """
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self._run, self._calls = method, 0
+
+    def __call__(self, *args: Any) -> Any:
+        """Calls it."""
+        self._calls += 1
+        if self._calls == _RECORDED_AT:
+            with suppress(Exception):  # a loss may branch on the minibatch's numbers
+                self._run = traced(self._run, *args)
+        return self._run(*args)
 
 
 def compiled(method: Callable[..., Any], config: Any, device: torch.device) -> Callable[..., Any]:
