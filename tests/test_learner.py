@@ -588,6 +588,31 @@ def test_no_denormal_numbers_gather_in_adam(make_learner: MakeLearner) -> None:
     assert torch.tensor(smallest) * 0.5 > 0
 
 
+def test_means_are_cleaned_where_several_threads_compute(make_learner: MakeLearner) -> None:
+    """The processor's mode is that of one thread; a run that goes on from a state is cleaned at the same updates."""
+    learner = make_learner(small_config("maddpg"))
+    batch = random_batch(learner.config)
+    batch = batch._replace(now=batch.now._replace(obs=batch.now.obs * (torch.arange(18) < 10)))
+    states = [learner._adam._optimizers[role].state[stack.flat] for role, stack in learner._roles.items()]
+
+    def denormals() -> int:
+        means = torch.cat([state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]).abs()
+        return int(((means > 0) & (means < torch.finfo(torch.float32).tiny)).sum())
+
+    for state in states:
+        state["exp_avg"].fill_(1e-39)
+    learner._updates_lifetime = 98
+    torch.set_num_threads(2)
+    try:
+        learner.step(batch)
+        assert denormals() > 100
+        learner.step(batch)
+        assert denormals() == 0
+    finally:
+        torch.set_num_threads(1)
+    assert all((state["exp_avg"] != 0).sum() > 1000 for state in states)
+
+
 def test_a_state_in_another_layout_is_refused(make_learner: MakeLearner) -> None:
     """Its numbers would fit, and be those of other parameters."""
     learner = make_learner(small_config("maddpg"))

@@ -24,14 +24,16 @@ from torch.func import grad_and_value
 
 from rllib_maobs.learner.compare import compare_networks
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
-from rllib_maobs.learner.update import Recorded, StackedAdam, clipped, compiled, denormals_are_zero
+from rllib_maobs.learner.update import Recorded, StackedAdam, clipped, compiled
 from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.denormals import denormals_are_zero
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
 from rllib_maobs.replay import Batch, Moment
 
 NUM_UPDATES_LIFETIME = "num_updates_lifetime"
 _PROGRESS = "progress"
+_CLEANED_EVERY = 100  # updates; a mean falls through all denormal numbers in some 150
 _LAYOUT = 3  # how numbers lie in flat tensors (`Stack`), and so in the optimisers' saved state
 
 
@@ -236,6 +238,8 @@ class JointLearner(TorchLearner):
         self._actor_updates += with_targets
         for role, gradient in gradients.items():
             self._adam.step(role, gradient)
+        if self._updates_lifetime % _CLEANED_EVERY == 0:
+            self._adam.clean()
         if with_targets:
             for role, stack in self._roles.items():
                 self._targets[role].flat.lerp_(stack.flat, self.config.tau)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -14,22 +14,6 @@ from rllib_maobs.modules import Params, Stack
 from rllib_maobs.modules.tracing import traced
 
 _RECORDED_AT = 100  # calls; recording one takes as long as some hundred of them
-
-
-@contextmanager
-def denormals_are_zero() -> Iterator[None]:
-    """Takes numbers below 1.2e-38 as zero, in this thread and for this block.
-
-    Adam's means of weights without a gradient fall below that within some hundred updates, and Intel's processors
-    compute with such numbers a hundred times slower: an update takes up to five times as long.
-    """
-    smallest = torch.finfo(torch.float32).tiny
-    was_on = bool(torch.tensor(smallest) * 0.5 == 0.0)  # torch has no way to ask
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(was_on)
 
 
 class StackedAdam:
@@ -89,6 +73,15 @@ class StackedAdam:
             amsgrad=False,
             maximize=False,
         )
+
+    def clean(self) -> None:
+        """Sets denormal means to zero, where several threads compute: `denormals_are_zero` is a matter of one."""
+        if torch.get_num_threads() == 1:
+            return
+        for role, stack in self._stacks.items():
+            state = self._optimizers[role].state[stack.flat]
+            for mean in (state["exp_avg"], state["exp_avg_sq"]):
+                mean.mul_(mean.abs() >= torch.finfo(mean.dtype).tiny)
 
 
 def clipped(gradient: Params, limit: float | None, by: str) -> Params:
