@@ -35,6 +35,11 @@ def number_of_parameters(learner: Any) -> int:
     return sum(stack.flat.numel() for stack in learner._roles.values())
 
 
+def weights_of(algo: Any) -> list[torch.Tensor]:
+    """All weights that an algorithm trains, a vector for each role."""
+    return [stack.flat for stack in learner_of(algo)._roles.values()]
+
+
 def adam_means(learner: Any) -> list[torch.Tensor]:
     """Adam's first means of all parameters, and its second ones."""
     states = [learner._adam._optimizers[role].state[stack.flat] for role, stack in learner._roles.items()]
