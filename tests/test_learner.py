@@ -9,7 +9,8 @@ import torch
 from torch.utils._pytree import tree_map
 
 import rllib_maobs as maobs
-from rllib_maobs.learner import JointLearner, TeamNetworks
+from rllib_maobs.algorithms.maddpg import MADDPGLearner
+from rllib_maobs.learner import JointLearner, TeamNetworks, update
 from rllib_maobs.modules import Stack
 from rllib_maobs.replay import Batch
 from tests.conftest import ALGORITHMS, random_batch, small_config
@@ -293,9 +294,80 @@ def test_compiled_equals_eager_over_many_updates(make_learner: MakeLearner, case
             for learner in (eager, compiled):
                 learner.update_normalizers(batch.now.window.transpose(1, 2).numpy())
         eager_report, compiled_report = eager.step(batch), compiled.step(batch)
-    assert compiled._compiled and not eager._compiled
     torch.testing.assert_close(compiled_report, eager_report, rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(compiled.acting.flat, eager.acting.flat, rtol=1e-6, atol=1e-8)
+
+
+def counted(learner: JointLearner) -> list[int]:
+    """Counts the calls of a learner's critic loss from now on, in a list of one number."""
+    calls, loss = [0], learner.critic_loss
+
+    def critic_loss(*args: Any) -> Any:
+        calls[0] += 1
+        return loss(*args)
+
+    learner.critic_loss = critic_loss  # type: ignore[method-assign]
+    return calls
+
+
+RECORDED: list[tuple[str, dict[str, Any], list[Any]]] = [
+    ("maddpg", {**TD3, "policy_delay": 2}, []),
+    ("maddpg-lstm", {"stored_state": True, "normalize_observations": True}, [learned_prey]),
+    ("facmac", {"grad_clip": 0.5}, [discrete]),
+    ("qmix", {"agent_id_input": True}, [two_policies]),
+    ("maddpg", {**ENTITY, "other_agents_actions": "joint"}, [one_policy]),
+]
+
+
+@pytest.mark.parametrize("case", RECORDED, ids=lambda case: case[0])
+def test_recorded_updates_are_the_same_to_the_bit(
+    make_learner: MakeLearner, monkeypatch: pytest.MonkeyPatch, case: tuple[str, dict[str, Any], list[Any]]
+) -> None:
+    monkeypatch.setattr(update, "_RECORDED_AT", 2)
+    algorithm, settings, changes = case
+    learners, calls = [], []
+    for recorded in (True, False):
+        config = small_config(algorithm).training(**settings)
+        for change in changes:
+            change(config)
+        learner = make_learner(config)
+        learner.recorded = recorded  # type: ignore[misc]
+        learners.append(learner)
+        calls.append(counted(learner))
+    for seed in range(6):
+        batch = random_batch(learners[0].config, seed=seed)
+        assert torch.equal(*(learner.step(batch) for learner in learners))
+        for role, stack in learners[0]._roles.items():
+            assert torch.equal(stack.flat, learners[1]._roles[role].flat)
+    # Once as it is and once to be recorded, of each kind of update.
+    assert calls == [[4 if "policy_delay" in settings else 2], [6]]
+
+
+@pytest.mark.parametrize("kind", ["own", "said", "branching"])
+def test_own_losses_are_recorded_only_if_their_class_says_so(
+    make_learner: MakeLearner, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(update, "_RECORDED_AT", 2)
+
+    class Own(MADDPGLearner):
+        pass
+
+    class Said(Own):
+        recorded = True
+
+    class Branching(Own):
+        recorded = True
+
+        def critic_loss(self, online: TeamNetworks, target: TeamNetworks, batch: Batch) -> Any:
+            losses, q = super().critic_loss(online, target, batch)
+            return (losses if bool(batch.rewards.mean() > 0) else 2.0 * losses), q  # which can't be recorded
+
+    cls = {"own": Own, "said": Said, "branching": Branching}[kind]
+    learner = make_learner(small_config("maddpg").learners(learner_class=cls))
+    calls = counted(learner)
+    for seed in range(4):
+        learner.step(random_batch(learner.config, seed=seed))
+    assert calls == [{"own": 4, "said": 2, "branching": 5}[kind]]
 
 
 def test_learners_of_one_process_do_not_share_compiled_code(make_learner: MakeLearner) -> None:
@@ -514,6 +586,31 @@ def test_no_denormal_numbers_gather_in_adam(make_learner: MakeLearner) -> None:
         means = learner._adam._optimizers[role].state[stack.flat]["exp_avg"].abs()
         assert (means == 0).any() and not ((means > 0) & (means < smallest)).any()
     assert torch.tensor(smallest) * 0.5 > 0
+
+
+def test_means_are_cleaned_where_several_threads_compute(make_learner: MakeLearner) -> None:
+    """The processor's mode is that of one thread; a run that goes on from a state is cleaned at the same updates."""
+    learner = make_learner(small_config("maddpg"))
+    batch = random_batch(learner.config)
+    batch = batch._replace(now=batch.now._replace(obs=batch.now.obs * (torch.arange(18) < 10)))
+    states = [learner._adam._optimizers[role].state[stack.flat] for role, stack in learner._roles.items()]
+
+    def denormals() -> int:
+        means = torch.cat([state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]).abs()
+        return int(((means > 0) & (means < torch.finfo(torch.float32).tiny)).sum())
+
+    for state in states:
+        state["exp_avg"].fill_(1e-39)
+    learner._updates_lifetime = 98
+    torch.set_num_threads(2)
+    try:
+        learner.step(batch)
+        assert denormals() > 100
+        learner.step(batch)
+        assert denormals() == 0
+    finally:
+        torch.set_num_threads(1)
+    assert all((state["exp_avg"] != 0).sum() > 1000 for state in states)
 
 
 def test_a_state_in_another_layout_is_refused(make_learner: MakeLearner) -> None:

@@ -198,3 +198,19 @@ def test_what_goes_wrong_in_an_environment_is_named(ray_session: None, options: 
     runner = runner_of(small_config("iddpg").environment(TwoAgents, env_config=options))
     with pytest.raises(ValueError, match=message):
         runner.sample(num_timesteps=20)
+
+
+def test_networks_act_without_denormal_numbers_and_environments_compute_with_them(ray_session: None) -> None:
+    runner = runner_of(small_config("maddpg"))
+    respond, step = runner.acting.actors.respond, runner.env.step
+    seen: dict[str, list[float]] = {"respond": [], "step": []}
+
+    def half() -> float:
+        return float(torch.tensor(torch.finfo(torch.float32).tiny) * 0.5)
+
+    runner.acting.actors.respond = lambda given: (seen["respond"].append(half()), respond(given))[1]
+    runner.env.step = lambda actions: (seen["step"].append(half()), step(actions))[1]
+    runner.sample(num_timesteps=8)
+    assert seen["respond"] and not any(seen["respond"])
+    assert seen["step"] and all(seen["step"])
+    runner.stop()

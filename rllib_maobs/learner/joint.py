@@ -24,14 +24,16 @@ from torch.func import grad_and_value
 
 from rllib_maobs.learner.compare import compare_networks
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
-from rllib_maobs.learner.update import StackedAdam, clipped, compiled, denormals_are_zero
+from rllib_maobs.learner.update import Recorded, StackedAdam, clipped, compiled
 from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.denormals import denormals_are_zero
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
 from rllib_maobs.replay import Batch, Moment
 
 NUM_UPDATES_LIFETIME = "num_updates_lifetime"
 _PROGRESS = "progress"
+_CLEANED_EVERY = 100  # updates; a mean falls through all denormal numbers in some 150
 _LAYOUT = 3  # how numbers lie in flat tensors (`Stack`), and so in the optimisers' saved state
 
 
@@ -47,10 +49,14 @@ class JointLearner(TorchLearner):
     over agents. With `config.framework(torch_compile_learner=True)` it is compiled, once per run; the numbers
     are the same up to float rounding. Compiled code keeps the Python values that a loss read when it was compiled:
     settings of `self.config`, attributes of `self`, numbers from elsewhere. What is to change during training is a
-    tensor of the minibatch, or `self.stage`: each stage is compiled on its own (see `stage_at`).
+    tensor of the minibatch, or `self.stage`: each stage is compiled on its own (see `stage_at`). Without compiling, a
+    learner of your own runs as Python at every update, unless it is `recorded`.
 
     Attributes:
         has_actors: Whether there are actors, and an `actor_loss`.
+        recorded: Whether an update that is not compiled is recorded after a while and played back, the same bits in
+            less than half of the time. Its losses are then held to what is said above. Only this package's learners
+            are, and those whose class says `recorded = True`.
         noise: Random numbers that the losses need, "normal" or "uniform" in [0, 1), as `batch.noise` `(B, N, A)`.
             Others would not be in a checkpoint. (Discrete actors have uniform ones, smoothed targets normal ones,
             anyway.)
@@ -61,7 +67,14 @@ class JointLearner(TorchLearner):
     """
 
     has_actors = True
+    recorded: ClassVar[bool] = True
     noise: ClassVar[Literal["normal", "uniform"] | None] = None
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Has the updates of a class from elsewhere run as they are, unless it says otherwise itself."""
+        super().__init_subclass__(**kwargs)
+        if "recorded" not in vars(cls):
+            cls.recorded = cls.__module__.startswith("rllib_maobs.")
 
     @override(TorchLearner)
     def __init__(self, **kwargs: Any) -> None:
@@ -73,9 +86,9 @@ class JointLearner(TorchLearner):
         self._sum: Tensor | None = None
         self._updates = self._actor_updates = 0
         self._updates_lifetime = self._env_steps = 0
-        # What an update may depend on but for numbers in tensors: each combination is compiled on its own.
+        # What an update may depend on but for numbers in tensors: each combination is compiled (recorded) on its own.
         self.stage = ""
-        self._compiled: dict[tuple[str, bool, int], Callable[..., Any]] = {}
+        self._made: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._with_actors = self.has_actors
 
     # What an algorithm defines.
@@ -191,12 +204,16 @@ class JointLearner(TorchLearner):
         self._with_actors = self.has_actors if with_actors is None else with_actors
         normalizer = {} if self.normalizers is None else self.normalizers.params
         arguments = self._params_of(self._roles), self._params_of(self._targets), normalizer, batch
-        if not self.config.torch_compile_learner:
-            return self.joint_gradients(*arguments)
         key = (self.stage, self._with_actors, len(batch.rewards))
-        if key not in self._compiled:
-            self._compiled[key] = compiled(self.joint_gradients, self.config, self._device)
-        return self._compiled[key](*arguments)
+        if key not in self._made:
+            self._made[key] = self._fast(self.joint_gradients)
+        return self._made[key](*arguments)
+
+    def _fast(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """A method as it is to be called again and again: compiled, recorded, or as it is."""
+        if self.config.torch_compile_learner:
+            return compiled(method, self.config, self._device)
+        return Recorded(method) if self.recorded else method
 
     @staticmethod
     def _params_of(stacks: dict[str, Stack]) -> dict[str, Params]:
@@ -221,6 +238,8 @@ class JointLearner(TorchLearner):
         self._actor_updates += with_targets
         for role, gradient in gradients.items():
             self._adam.step(role, gradient)
+        if self._updates_lifetime % _CLEANED_EVERY == 0:
+            self._adam.clean()
         if with_targets:
             for role, stack in self._roles.items():
                 self._targets[role].flat.lerp_(stack.flat, self.config.tau)

@@ -87,13 +87,13 @@ class TeamNetworks:
             return self._cut(torch.tanh(outputs))
         assert noise is not None
         soft = F.softmax((self.legal(outputs) + gumbel(noise)) / self.config.gumbel_temperature, dim=-1)
-        return F.one_hot(soft.argmax(-1), soft.shape[-1]) + soft - soft.detach()
+        return highest(soft) + soft - soft.detach()
 
     def next_actions(self, batch: Batch) -> Tensor:
         """mu(o') of these networks, smoothed by clipped noise if so configured (TD3): `(B, N, A)`."""
         outputs, config = self.outputs(batch.next), self.config
         if config.team.discrete:
-            return F.one_hot(self.legal(outputs).argmax(-1), outputs.shape[-1]).to(outputs.dtype)
+            return highest(self.legal(outputs))
         actions = self.actions(outputs, None)
         if not config.target_noise:
             return actions
@@ -169,6 +169,11 @@ class TeamNetworks:
 def _given(state: Tensor | None) -> Tensor:
     assert state is not None, "The algorithm sees a state, but the minibatch has none."
     return state
+
+
+def highest(values: Tensor) -> Tensor:
+    """One-hot vectors of the highest values `(..., A)`; unlike `F.one_hot`, which looks at numbers, it is recorded."""
+    return (values.argmax(-1, keepdim=True) == torch.arange(values.shape[-1], device=values.device)).to(values.dtype)
 
 
 def one_current(actions: Tensor, fixed: Tensor) -> Tensor:

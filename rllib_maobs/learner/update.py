@@ -1,9 +1,9 @@
-"""What an update does with gradients: clipping and Adam; and how their computation is compiled."""
+"""What an update does with gradients: clipping and Adam; and how their computation is recorded or compiled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -11,22 +11,9 @@ import torch
 from torch import Tensor
 
 from rllib_maobs.modules import Params, Stack
+from rllib_maobs.modules.tracing import traced
 
-
-@contextmanager
-def denormals_are_zero() -> Iterator[None]:
-    """Takes numbers below 1.2e-38 as zero, in this thread and for this block.
-
-    Adam's means of weights without a gradient fall below that within some hundred updates, and Intel's processors
-    compute with such numbers a hundred times slower: an update takes up to five times as long.
-    """
-    smallest = torch.finfo(torch.float32).tiny
-    was_on = bool(torch.tensor(smallest) * 0.5 == 0.0)  # torch has no way to ask
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(was_on)
+_RECORDED_AT = 100  # calls; recording one takes as long as some hundred of them
 
 
 class StackedAdam:
@@ -87,6 +74,15 @@ class StackedAdam:
             maximize=False,
         )
 
+    def clean(self) -> None:
+        """Sets denormal means to zero, where several threads compute: `denormals_are_zero` is a matter of one."""
+        if torch.get_num_threads() == 1:
+            return
+        for role, stack in self._stacks.items():
+            state = self._optimizers[role].state[stack.flat]
+            for mean in (state["exp_avg"], state["exp_avg_sq"]):
+                mean.mul_(mean.abs() >= torch.finfo(mean.dtype).tiny)
+
 
 def clipped(gradient: Params, limit: float | None, by: str) -> Params:
     """A role's gradient, clipped.
@@ -111,6 +107,27 @@ def clipped(gradient: Params, limit: float | None, by: str) -> Params:
         name: g * (limit / squares[name].sqrt().clamp(min=limit)).view(-1, *[1] * (g.dim() - 1))
         for name, g in gradient.items()
     }
+
+
+class Recorded:
+    """A method that runs as it is for some calls, and whose tensor operations are then recorded and played back.
+
+    The numbers are the same bit for bit, see `traced`. What can't be recorded goes on as it is.
+
+    Args:
+        method: The method. Its arguments may change in nothing but the numbers in their tensors.
+    """
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self._run, self._calls = method, 0
+
+    def __call__(self, *args: Any) -> Any:
+        """Calls it."""
+        self._calls += 1
+        if self._calls == _RECORDED_AT:
+            with suppress(Exception):  # a loss may branch on the minibatch's numbers
+                self._run = traced(self._run, *args)
+        return self._run(*args)
 
 
 def compiled(method: Callable[..., Any], config: Any, device: torch.device) -> Callable[..., Any]:

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
-from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._pytree import tree_map
 
+from rllib_maobs.modules.tracing import traced
 from rllib_maobs.registry import same
 
 Params = dict[str, Tensor]
@@ -252,8 +252,7 @@ class Stack:
     def act(self, *inputs: Input, function: Function = "forward") -> Any:
         """`__call__` with the present parameters and without gradients, for one call after the other.
 
-        The plain tensor operations behind `vmap` are recorded at the first call for inputs of some shape, and played
-        back from then on: for small inputs most of the time of a call goes into finding them.
+        Its tensor operations are recorded at the first call for inputs of some shape, see `traced`.
         """
         kinds = [(type(given), given[1:]) for given in inputs]
         tensors = [given.tensor for given in inputs]
@@ -264,7 +263,7 @@ class Stack:
                 again = [kind(tensor, *rest) for tensor, (kind, rest) in zip(tensors, kinds, strict=True)]
                 return self(params, *again, function=function)
 
-            self._recorded[key] = make_fx(call)(self.params, *tensors).forward
+            self._recorded[key] = traced(call, self.params, *tensors)
         return self._recorded[key](self.params, *tensors)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from rllib_maobs.envs.team import Team
 from rllib_maobs.modules import AgentModule, PerAgent, Seen
 from rllib_maobs.modules.agent import append
+from rllib_maobs.modules.denormals import denormals_are_zero
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors
@@ -140,7 +141,8 @@ class Acting:
         seen = Seen(*(None if part is None else part.to(device) for part in seen))  # type: ignore[arg-type]
         if self.normalizers is not None:
             seen = seen._replace(obs=self.normalizers.act(PerAgent(seen.obs)))
-        outputs, state = self.actors.respond(seen)
+        with denormals_are_zero():
+            outputs, state = self.actors.respond(seen)
         if self._recurrent_state is not None:  # it goes on with the window, whatever chooses the actions
             assert state is not None
             self._recurrent_state = state.cpu()

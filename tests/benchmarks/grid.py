@@ -4,9 +4,10 @@
     OMP_NUM_THREADS=1 python tests/benchmarks/grid.py --experiments spread9a --algos maddpg maddpg-lstm --seconds 10
 
 A cell is an experiment of `tuned_examples/` (its environment, batch size, window) and one of its algorithms, trained as
-its script would: one update per env step, an evaluation every 1000. Each runs in a process of its own, bound to a core,
-as many at once as `--cores`: a core's neighbours are as busy as they will be. Measured is a warmed-up time after
-compiling; the hours are those of the script's env steps at that pace.
+its script would: the paper's with one update per env step, an evaluation every 1000. Beside these are two cells of
+entity networks, with fewer and larger updates that are not mostly products. Each cell runs in a process of its own,
+bound to a core, as many at once as `--cores`: a core's neighbours are as busy as they will be. Measured is a warmed-up
+time after compiling; the hours are those of the script's env steps at that pace.
 
 The columns: what `train()` makes in env steps/s, and the shares of its time (RLlib's is all that is left: metrics,
 weight sync, Python between updates); the update alone, beside the loop over agents in ordinary PyTorch
@@ -53,6 +54,7 @@ from tests.benchmarks.workers import Job, Worker, free_cores
 
 EXPERIMENTS = ["obstacle_predator_prey", "spread3a", "spread6a", "spread9a", "tunnel", "simple_tunnel"]
 EXPERIMENTS += ["simple_tunnel6a"]
+ENTITIES = [("spread3a", "maddpg-entity"), ("spread9a", "maddpg-entity")]  # not of the paper: no part of its hours
 PARTS = ["acting", "env", "replay", "update", "evaluation", "RLlib"]
 HOURS, RLLIB_SHARE = 24.0, 0.2  # bars
 
@@ -98,6 +100,7 @@ def measure(spec: TrialSpec, seconds: float) -> dict[str, Any]:
         "update": ours,
         "loop": loop,
         "limit": limit(learner, batch),
+        "updates": config.updates_per_env_step,
         "first": first,
         "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 + bytes_of_replay(algo),
     }
@@ -106,11 +109,12 @@ def measure(spec: TrialSpec, seconds: float) -> dict[str, Any]:
 
 
 def spec_of(experiment: str, algorithm: str, critic_state: str) -> tuple[TrialSpec, int]:
-    """A cell's trial as its script makes it, and the script's env steps."""
+    """A cell's trial as its script makes it, and its env steps."""
     own = importlib.import_module(f"tuned_examples.{experiment}").experiment
     parser = make_parser(own.name, own.algorithms, own.stop_timesteps)
     arguments = parser.parse_args(["--algos", algorithm, "--seeds", "0", "--critic-state", critic_state])
-    return own.specs(arguments)[0], own.stop_timesteps
+    spec = own.specs(arguments)[0]
+    return spec, spec.stop_timesteps
 
 
 def prepare(experiment: str, algorithm: str, critic_state: str) -> Job:
@@ -153,7 +157,7 @@ def row_of(experiment: str, algorithm: str, r: dict[str, Any]) -> list[str]:
         f"{1 / r['update']:.0f}",
         loop,
         f"{1 / r['limit']:.0f}",
-        f"{100 * r['limit'] * r['env steps/s']:.0f} %",
+        f"{100 * r['limit'] * r['updates'] * r['env steps/s']:.0f} %",
         f"{r['memory'] / 1e9:.1f}",
         f"{r['steps'] / r['env steps/s'] / 3600:.2f}",
     ]
@@ -176,7 +180,7 @@ def main() -> None:
         (name, algorithm)
         for name in arguments.experiments
         for algorithm in importlib.import_module(f"tuned_examples.{name}").experiment.algorithms
-        if algorithm in maobs.ALGORITHMS  # the paper's rows
+        if algorithm in maobs.ALGORITHMS or (name, algorithm) in ENTITIES
         if not arguments.algos or algorithm in arguments.algos
     ]
     if not cells:
@@ -193,12 +197,15 @@ def main() -> None:
         with arguments.csv.open("w", newline="") as file:
             csv.writer(file).writerows([header, *rows])
 
-    steps = sum(r["steps"] for r in results)
-    seconds = sum(r["steps"] / r["env steps/s"] for r in results)
-    at_limit = sum(r["steps"] * r["limit"] for r in results)
+    paper = [r for (_, algorithm), r in zip(cells, results, strict=True) if algorithm in maobs.ALGORITHMS]
+    if not paper:
+        return
+    steps = sum(r["steps"] for r in paper)
+    seconds = sum(r["steps"] / r["env steps/s"] for r in paper)
+    at_limit = sum(r["steps"] * r["limit"] for r in paper)
     hours = seconds / 3600 / arguments.cores
-    share = max(r["parts"]["RLlib"] for r in results)
-    first = max(r["first"] for r in results)
+    share = max(r["parts"]["RLlib"] for r in paper)
+    first = max(r["first"] for r in paper)
     print(
         f"\n{steps / 1e6:.0f} million env steps: {hours:.1f} hours on {arguments.cores} core(s), "
         f"{steps / seconds:.0f} env steps/s per core; at the limit {at_limit / 3600 / arguments.cores:.1f} hours. "

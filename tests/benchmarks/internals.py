@@ -35,6 +35,23 @@ def number_of_parameters(learner: Any) -> int:
     return sum(stack.flat.numel() for stack in learner._roles.values())
 
 
+def weights_of(algo: Any) -> list[torch.Tensor]:
+    """All weights that an algorithm trains, a vector for each role."""
+    return [stack.flat for stack in learner_of(algo)._roles.values()]
+
+
+def adam_means(learner: Any) -> list[torch.Tensor]:
+    """Adam's first means of all parameters, and its second ones."""
+    states = [learner._adam._optimizers[role].state[stack.flat] for role, stack in learner._roles.items()]
+    return [torch.cat([state[name] for state in states]) for name in ("exp_avg", "exp_avg_sq")]
+
+
+def flushing(what: str) -> str:
+    """What flushes denormal numbers in updates, for `mock.patch`: the processor's "mode" or the "cleaning"."""
+    owner = "rllib_maobs.learner.joint"
+    return {"mode": f"{owner}.denormals_are_zero", "cleaning": f"{owner}.StackedAdam.clean"}[what]
+
+
 def minibatch(algo: Any, *shape: int) -> Batch:
     """A minibatch from an algorithm's replay, or with `(K, B)` K of them in one draw."""
     return algo.replay_buffer.sample(shape, gamma=algo.config.gamma, seq_length=algo.config.window_length)
