@@ -346,8 +346,8 @@ def used(tmp_path: Path) -> Path:
         ("--results-dir used", "used is not empty: continue the run there with --resume, or choose another"),
         ("--results-dir used/experiment.json", "experiment.json is not a folder"),
         (
-            "--results-dir used --resume --stop-timesteps 5",
-            "--stop-timesteps: the original run has what each row has for itself, and --resume continues it",
+            "--results-dir used --resume --train-horizon 5",
+            "--train-horizon: the original run has what each row has for itself, and --resume continues it",
         ),
         ("--results-dir used --resume --seeds 5", "--seeds: the original run has [0, 1, 2], and --resume continues it"),
     ],
