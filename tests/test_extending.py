@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import torch
 from ray.rllib.core.rl_module import RLModule
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rllib_maobs.checkpoints import find_checkpoint
 from rllib_maobs.experiment import Experiment, decayed, load_curves
@@ -82,6 +83,12 @@ def test_a_longer_run_is_as_one_of_that_length(run: SimpleNamespace) -> None:
     module = find_checkpoint(run.folder / "iddpg-seed0") / "learner_group" / "learner" / "rl_module" / "agent_1"
     there = RLModule.from_checkpoint(module).state_dict()
     assert all(torch.equal(there[name], value) for name, value in weights.items()) and there.keys() == weights.keys()
+
+
+def test_tensorboard_goes_on_too(run: SimpleNamespace) -> None:
+    events = EventAccumulator(str(run.folder / "iddpg-seed0"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("evaluation/score")] == [24, 48, 72, 96]
 
 
 def test_seeds_and_algorithms_are_added(run: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
 
 _FILE = "experiment.json"
-_BEFORE_START = (_FILE, "tuner.pkl", LOCK)  # What is written before the first trial starts.
+_BEFORE_START = (_FILE, "tuner.pkl", "mlflow.db", LOCK)  # What is written before the first trial starts.
 # What --quick changes; a flag that is given still wins.
 QUICK = {"seeds": [0], "checkpoint_freq": 2}
 # What decides the results: a resumed run must have the same.
@@ -164,6 +164,12 @@ def make_parser(
     )
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
     how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard (pip install ray[default])")
+
+    how.add_argument("--wandb", action="store_true", help="log to Weights & Biases; WANDB_MODE=offline keeps it here")
+    how.add_argument(
+        "--mlflow", action="store_true", help="log to MLflow: to MLFLOW_TRACKING_URI, or mlflow.db in --results-dir"
+    )
+    how.add_argument("--video", action="store_true", help="film an episode of every checkpoint, for TensorBoard")
 
     where = parser.add_argument_group("where results go")
     where.add_argument(

@@ -21,6 +21,7 @@ from rllib_maobs.checkpoints import saved_networks
 from rllib_maobs.experiment.arguments import has_started, make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.claim import claim
+from rllib_maobs.experiment.dashboards import check_dashboards
 from rllib_maobs.experiment.film import film_best
 from rllib_maobs.experiment.plan import of_one_seed, print_plan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
@@ -121,6 +122,7 @@ class Experiment:
         args = parse(parser, self.name, argv, self.quick_algorithms)
         _quiet()
         try:
+            check_dashboards(args, self.env)
             if args.search:
                 check_installed()
             specs = self.specs(args)

@@ -8,6 +8,7 @@ from typing import Any
 from ray import tune
 
 from rllib_maobs.experiment.arguments import save_settings
+from rllib_maobs.experiment.dashboards import make_callbacks
 from rllib_maobs.experiment.plan import print_rest
 from rllib_maobs.experiment.progress import ProgressTable
 from rllib_maobs.experiment.resume import (
@@ -41,6 +42,7 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
         storage_path=str(args.results_dir.parent),
         checkpoint_config=_checkpoints(args),
         progress_reporter=_progress(args),
+        callbacks=make_callbacks(name, args),
         verbose=1,
     )
     tune_config = tune.TuneConfig(
@@ -97,6 +99,7 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         search_alg=way,
         scheduler=_scheduler(search, specs),
         progress_reporter=_progress(args),
+        callbacks=make_callbacks(name, args),
         raise_on_failed_trial=False,
         verbose=1,
     )
