@@ -56,7 +56,9 @@ def make_callbacks(name: str, args: Namespace) -> list[tune.Callback]:
         class Wandb(_Grouped, WandbLoggerCallback):
             pass
 
-        callbacks.append(Wandb(project=name, group=args.results_dir.name, dir=str(args.results_dir)))
+        # It logs in processes of a Ray that may have been started before WANDB_MODE was set.
+        mode = os.environ.get("WANDB_MODE")
+        callbacks.append(Wandb(project=name, group=args.results_dir.name, dir=str(args.results_dir), mode=mode))
     if args.mlflow:
         from ray.air.integrations.mlflow import MLflowLoggerCallback
 
