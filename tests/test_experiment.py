@@ -59,6 +59,7 @@ def result(algorithm: str, seed: int, steps: int, score: float, coverage: float 
         STEPS: float(steps),
         "time_this_iter_s": 2.0,
         "time_total_s": steps / 50,
+        "learners": {"__all_modules__": {}, "agent_0": {}},
         "evaluation": {
             "env_runners": {
                 "agent_episode_returns_mean": {"agent_1": -1.0, "agent_0": score},
@@ -290,6 +291,8 @@ def test_progress_table() -> None:
     running = fake("maddpg", 0, 1000, status="RUNNING", last_result=result("maddpg", 0, 100, -5.0))
     waiting = fake("iddpg", 0, 500, status="PENDING", last_result={})
     trials = [running, waiting]
+    assert not table.should_report([waiting])
+    assert table.should_report(trials)  # the first table comes at once
     assert not table.should_report(trials)
     running.last_result = result("maddpg", 0, 200, -4.0)
     # 100 env steps since the first result took 2 s; 800 are left here, and then all 500 of the one that waits.
@@ -300,13 +303,30 @@ def test_progress_table() -> None:
     assert second.split() == ["iddpg-seed0", "waiting", "0", "/", "500", "-", "-", "-", "-", "-"]
 
 
+def test_the_first_update_is_announced() -> None:
+    """It is compiled, for longer than a user would think that all is well; trials that act only do not say so."""
+    table = ProgressTable(every_s=30.0)
+    trial = fake("maddpg", 0, 1000, status="RUNNING", last_result={})
+    for compiled in (True, False):
+        trial.config["torch_compile"] = compiled
+        lines = table.table([trial]).splitlines()
+        assert lines[2].split()[1] == "starting"
+        said = "starting: the first update is compiled, which takes half a minute to a minute"
+        assert (lines[-1] == said) is compiled
+    trial.config["torch_compile"] = True
+    trial.last_result = result("maddpg", 0, 100, -5.0) | {"learners": {"__all_modules__": {"x": 1}}}
+    assert "starting" in table.table([trial])
+    trial.last_result = result("maddpg", 0, 100, -5.0)
+    assert "starting" not in table.table([trial]) and "running" in table.table([trial])
+
+
 def test_a_trial_that_waits_is_as_fast_as_another_seed_of_its_algorithm() -> None:
     table = ProgressTable(every_s=30.0)
     slow = fake("maddpg", 0, 1000, status="RUNNING", last_result=result("maddpg", 0, 100, -5.0))
     fast = fake("iddpg", 0, 1000, status="RUNNING", last_result=result("iddpg", 0, 100, -5.0))
     waiting = fake("iddpg", 1, 2000, status="PENDING", last_result={})
     trials = [slow, fast, waiting]
-    assert not table.should_report(trials)
+    table.should_report(trials)
     slow.last_result = result("maddpg", 0, 200, -4.0)  # 50 env steps/s
     fast.last_result = result("iddpg", 0, 200, -4.0) | {"time_total_s": 2.5}  # 200 env steps/s
     # 16 s are left of the slow one, 4 s of the fast one, and then 10 s.
@@ -346,8 +366,8 @@ def used(tmp_path: Path) -> Path:
         ("--results-dir used", "used is not empty: continue the run there with --resume, or choose another"),
         ("--results-dir used/experiment.json", "experiment.json is not a folder"),
         (
-            "--results-dir used --resume --stop-timesteps 5",
-            "--stop-timesteps: the original run has what each row has for itself, and --resume continues it",
+            "--results-dir used --resume --train-horizon 5",
+            "--train-horizon: the original run has what each row has for itself, and --resume continues it",
         ),
         ("--results-dir used --resume --seeds 5", "--seeds: the original run has [0, 1, 2], and --resume continues it"),
     ],

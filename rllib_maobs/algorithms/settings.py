@@ -415,11 +415,12 @@ def changed(config: JointConfig) -> Iterator[tuple[str, Any, Any]]:
 def without_effect(config: JointConfig) -> dict[str, str]:
     """The settings of ours that are set, but do nothing with this algorithm and its other settings; and why."""
     given = {name for name, _, _ in changed(config)}
-    return {
-        name: why.format(name=config.name)
-        for name, (has_effect, why) in _NEEDS.items()
-        if name in given and not has_effect(config)
-    }
+    return {name: why for name, why in unheard(config).items() if name in given}
+
+
+def unheard(config: JointConfig) -> dict[str, str]:
+    """The settings of ours that would do nothing with this algorithm and its other settings, set or not; and why."""
+    return {name: why.format(name=config.name) for name, (has_effect, why) in _NEEDS.items() if not has_effect(config)}
 
 
 def plain(value: Any) -> Any:

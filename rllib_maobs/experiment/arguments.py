@@ -10,9 +10,10 @@ from typing import Any
 from rllib_maobs.experiment.claim import LOCK
 from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
+from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
 
 _FILE = "experiment.json"
-_BEFORE_START = (_FILE, "tuner.pkl", LOCK)  # What is written before the first trial starts.
+_BEFORE_START = (_FILE, "tuner.pkl", "mlflow.db", LOCK)  # What is written before the first trial starts.
 # What --quick changes; a flag that is given still wins.
 QUICK = {"seeds": [0], "checkpoint_freq": 2}
 # What decides the results: a resumed run must have the same.
@@ -27,6 +28,10 @@ SETTINGS = (
     "no_compile",
     "quick",
     "start_from",
+    "sweep",
+    "search",
+    "num_samples",
+    "lengthened_to",
 )
 
 
@@ -94,7 +99,13 @@ def make_parser(
     parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
     what = parser.add_argument_group("what to train")
     what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
-    what.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2], help="one trial per algorithm and seed")
+    what.add_argument(
+        "--seeds",
+        nargs="+",
+        type=seed,
+        default=[0, 1, 2],
+        help="one trial per algorithm and seed; of a search, the one seed (default: 0)",
+    )
     # None: each row has its own, and what is given here holds for all.
     what.add_argument(
         "--stop-timesteps",
@@ -122,6 +133,22 @@ def make_parser(
         help="start from the networks of another run, such as a trial's folder of a smaller team; all rows must have "
         "networks of the same kind",
     )
+    what.add_argument(
+        "--sweep",
+        nargs="*",
+        metavar="SETTING=VALUE,VALUE",
+        help="train every row with all combinations of some settings' values, where it takes them, such as "
+        "actor_lr=1e-3,3e-4 tau=0.01,0.005; with --search also ranges, such as tau=0.001..0.1; without any, those that "
+        f"the paper's tables have: {' '.join(OF_THE_PAPER)}",
+    )
+    what.add_argument(
+        "--search",
+        choices=["optuna"],
+        help="instead of all combinations, let Optuna look for the best rows and settings among those of --sweep, and "
+        f"stop early what scores worse than two thirds of the trials that have come as far (ASHA); without --sweep "
+        f"among {' '.join(SEARCHED)}",
+    )
+    what.add_argument("--num-samples", type=positive, default=50, help="trials of a search")
     what.add_argument("--quick", action="store_true", help=f"a small job of about five minutes: {quick}")
 
     how = parser.add_argument_group("how to run it")
@@ -140,6 +167,12 @@ def make_parser(
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
     how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard (pip install ray[default])")
 
+    how.add_argument("--wandb", action="store_true", help="log to Weights & Biases; WANDB_MODE=offline keeps it here")
+    how.add_argument(
+        "--mlflow", action="store_true", help="log to MLflow: to MLFLOW_TRACKING_URI, or mlflow.db in --results-dir"
+    )
+    how.add_argument("--video", action="store_true", help="film an episode of every checkpoint, for TensorBoard")
+
     where = parser.add_argument_group("where results go")
     where.add_argument(
         "--results-dir",
@@ -155,7 +188,14 @@ def make_parser(
     where.add_argument(
         "--resume",
         action="store_true",
-        help="go on with the run in --results-dir from its last checkpoints, with its settings; finished trials stay",
+        help="go on with the run in --results-dir from its last checkpoints, with its settings; finished trials stay, "
+        "unless --stop-timesteps is more than they had",
+    )
+    where.add_argument(
+        "--add-seeds", nargs="+", type=seed, default=[], help="resume, with trials of more seeds for every algorithm"
+    )
+    where.add_argument(
+        "--add-algos", nargs="+", choices=algos, default=[], help="resume, with trials of more algorithms"
     )
     return parser
 
@@ -175,13 +215,18 @@ def parse(
         The arguments, with an absolute `results_dir`; those of the original run with `--resume`.
     """
     args = parser.parse_args(argv)
+    if args.search:
+        parser.set_defaults(seeds=[0])
+        args = parser.parse_args(argv)
+        if len(args.seeds) > 1:
+            parser.error("--seeds: a search has one seed; train the best settings with more of them by --sweep")
     if args.quick:
         parser.set_defaults(**QUICK, **({"algos": list(quick_algos)} if quick_algos else {}))
         args = parser.parse_args(argv)
-    for flag in ("algos", "seeds"):
-        values = getattr(args, flag)
+    for several in ("algos", "seeds", "add_algos", "add_seeds"):
+        values = getattr(args, several)
         if len(set(values)) < len(values):
-            parser.error(f"--{flag}: {' '.join(map(str, values))} names one of them twice")
+            parser.error(f"{_flag(several)}: {' '.join(map(str, values))} names one of them twice")
     if args.address and args.workers != parser.get_default("workers"):
         parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
 
@@ -189,13 +234,15 @@ def parse(
     results_dir = results_dir.expanduser().resolve()
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
+    args.resume = args.resume or bool(args.add_seeds or args.add_algos)
+    args.lengthened_to = None
     if args.resume:
         if not has_started(results_dir) or not (results_dir / _FILE).is_file():
             parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
         stored = json.loads((results_dir / _FILE).read_text())
         if (other := stored.pop("experiment")) != name:
             parser.error(f"{results_dir} holds a run of {other}, not of {name}: correct --results-dir")
-        args = _with_stored_settings(parser, argv, stored)
+        args = _with_stored_settings(parser, argv, {"lengthened_to": None, **stored})
     elif has_started(results_dir):
         parser.error(
             f"{results_dir} is not empty: continue the run there with --resume, or choose another --results-dir"
@@ -209,18 +256,38 @@ def has_started(results_dir: Path) -> bool:
     return results_dir.is_dir() and any(path.name not in _BEFORE_START for path in results_dir.iterdir())
 
 
+def _flag(name: str) -> str:
+    return "--from" if name == "start_from" else f"--{name.replace('_', '-')}"
+
+
 def _with_stored_settings(
     parser: argparse.ArgumentParser, argv: Sequence[str] | None, stored: dict[str, Any]
 ) -> argparse.Namespace:
-    """Parse again with the settings of the original run as defaults, and refuse flags that contradict them."""
+    """Parse again with the settings of the original run as defaults, and refuse flags that contradict them.
+
+    The trials may become longer and more; `stop_timesteps` stays what they had at first.
+    """
     parser.set_defaults(**stored)
     args = parser.parse_args(argv)
+    args.resume = True
+    longer = args.stop_timesteps if args.stop_timesteps != stored["stop_timesteps"] else None
+    args.stop_timesteps = stored["stop_timesteps"]
     for name, value in stored.items():
         if getattr(args, name) != value:
-            flag = "--from" if name == "start_from" else f"--{name.replace('_', '-')}"
             stands = "what each row has for itself" if value is None else value
             parser.error(
-                f"{flag}: the original run has {stands}, and --resume continues it as it is: leave {flag} out, or "
-                f"start a new run in another --results-dir"
+                f"{_flag(name)}: the original run has {stands}, and --resume continues it as it is: leave "
+                f"{_flag(name)} out, or start a new run in another --results-dir"
             )
+    if args.search and (longer or args.add_seeds or args.add_algos):
+        parser.error(
+            "the run is a search, which compares trials of one length: start a new one in another --results-dir"
+        )
+    if longer and longer < (args.lengthened_to or 0):
+        parser.error(f"--stop-timesteps: {longer:,} is less than the {args.lengthened_to:,} that the trials have")
+    args.lengthened_to = longer or args.lengthened_to
+    for name in ("algos", "seeds"):
+        if known := [value for value in getattr(args, f"add_{name}") if value in stored[name]]:
+            parser.error(f"--add-{name}: {' '.join(map(str, known))} is there already; --resume goes on with it")
+        setattr(args, name, [*stored[name], *getattr(args, f"add_{name}")])
     return args

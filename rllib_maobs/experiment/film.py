@@ -28,18 +28,31 @@ def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[
     spec = next((spec for spec in specs if spec.name == name), None)
     if spec is None:
         return "No film: nothing has been evaluated."
-    scenario = spec.env.removeprefix("maobs/")
-    if scenario not in SCENARIOS:
+    if spec.env.removeprefix("maobs/") not in SCENARIOS:
         return f"No film: {spec.env} is not an environment of this package."
     checkpoint = max((results_dir / spec.name).glob("checkpoint_*"), default=None)
     if checkpoint is None:
         return f"No film: {spec.name}, the best one, has no checkpoint."
     try:
-        recorder = Recorder(results_dir / FILM)
-        env = parallel_env(scenario, render_mode="rgb_array", **spec.evaluation_options)
-        play(env, make_policy(env.vector, str(checkpoint)), recorder=recorder)
-        recorder.close()
+        film(spec, checkpoint, results_dir / FILM)
     except Exception as error:  # Whatever it is, the results are there, and matter more.
         return f"No film: {str(error).partition(chr(10))[0] or type(error).__name__}"
     embed_film(results_dir, spec.name)
-    return f"An episode of {spec.name}, the best one: {recorder.path}"
+    return f"An episode of {spec.name}, the best one: {results_dir / FILM}"
+
+
+def film(spec: TrialSpec, checkpoint: str | Path, path: Path) -> None:
+    """Film an episode as a checkpoint plays it.
+
+    Args:
+        spec: The trial whose checkpoint it is, on an environment of this package.
+        checkpoint: Folder of the checkpoint.
+        path: The film's file.
+
+    Raises:
+        ImportError: If a package for pictures is missing.
+    """
+    recorder = Recorder(path)
+    env = parallel_env(spec.env.removeprefix("maobs/"), render_mode="rgb_array", **spec.evaluation_options)
+    play(env, make_policy(env.vector, str(checkpoint)), recorder=recorder)
+    recorder.close()

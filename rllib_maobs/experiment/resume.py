@@ -3,25 +3,63 @@
 import glob
 import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray import tune
 from ray.rllib.utils.annotations import override
 from ray.tune.search.basic_variant import BasicVariantGenerator
 
 TESTED_RAY = (2, 60)
 """The release of Ray, any patch of it, whose saved state this was tried with: the range in `pyproject.toml`."""
+STATES = "experiment_state-*.json"
+"""Tune's saved states, one for each time that a run was started or resumed; it goes on from the newest."""
 _DECISIONS = "_cached_trial_decisions"
 
 
+NOT_RESTORED = (
+    "Ray Tune could not restore the state of this run (see the log above); nothing was started or written over: try "
+    "again, or restore the folder from a copy"
+)
+
+
+class StateError(RuntimeError):
+    """Tune's saved state is not what it must be to go on with a run."""
+
+
 class Grid(BasicVariantGenerator):
-    """Tune's own way through a grid of trials, which finds its state again in a folder with brackets in its name."""
+    """Tune's own way through a grid of trials, but a resumed run may have more trials than it had at first.
+
+    Args:
+        resumed: Whether a run is resumed. Should Tune fail to, it would start all trials once more; not with this.
+        rest: For a resumed run, the trials that Tune's saved state does not hold yet, if there are any.
+    """
+
+    def __init__(self, *, resumed: bool = False, rest: tune.Experiment | None = None) -> None:
+        super().__init__()
+        self._rest = rest
+        # None: there is nothing to restore.
+        self.restored = False if resumed else None
+
+    @override(BasicVariantGenerator)
+    def add_configurations(self, experiments: Any) -> None:
+        """Take trials to start."""
+        if self.restored is False:
+            raise StateError(NOT_RESTORED)
+        super().add_configurations(experiments)
 
     @override(BasicVariantGenerator)
     def restore_from_dir(self, dirpath: str) -> None:
-        """Go on from the newest state in a folder; Tune takes the folder's name for a pattern."""
-        super().restore_from_dir(glob.escape(dirpath))
+        """Go on from the newest state in a folder, with the trials that are left."""
+        rest = self._rest
+        super().restore_from_dir(glob.escape(dirpath))  # Tune takes the folder's name for a pattern.
+        # What the state had left is among the rest.
+        self.__dict__ |= {"_iterators": [], "_trial_generator": [], "_finished": rest is None}
+        self.restored, self._rest = True, None
+        if rest is not None:
+            self.add_configurations([rest])
 
 
 def forget_decisions(results_dir: Path) -> None:
@@ -39,7 +77,7 @@ def forget_decisions(results_dir: Path) -> None:
     Args:
         results_dir: The folder of the run; of its state files Tune reads the newest, and so does this.
     """
-    path = max(results_dir.glob("experiment_state-*.json"), default=None)
+    path = _newest(results_dir)
     if path is None:  # Tune says so itself.
         return
     tested = ".".join(map(str, TESTED_RAY))
@@ -52,6 +90,78 @@ def forget_decisions(results_dir: Path) -> None:
         _warn(f"{path.name} does not look as Ray {tested} writes it.")
         return
     decisions.clear()
+    _replace(path, state)
+
+
+def known_trials(results_dir: Path) -> set[str]:
+    """Return the names of the trials that Tune's saved state holds, whether they have ended or not.
+
+    Raises:
+        StateError: If the state is not as the release of Ray that this was tried with writes it.
+    """
+    _, _, trials = _trials(results_dir)
+    return {_name(trial) for trial in trials}
+
+
+def lengthen(results_dir: Path, stops: Mapping[str, int]) -> list[str]:
+    """Let trials of Tune's saved state run longer than they were meant to, also those that have ended.
+
+    Tune resumes no trial that has ended, and keeps the config that a trial had; it has no setting for either. What
+    else the config says stays: rates that fall with the length of a trial were made for its first length.
+
+    Args:
+        results_dir: The folder of the run.
+        stops: Env steps after which each trial is done, by its name.
+
+    Returns:
+        The names of the trials that are longer now.
+
+    Raises:
+        StateError: If the state is not as the release of Ray that this was tried with writes it.
+    """
+    path, state, trials = _trials(results_dir)
+    longer = []
+    for entry, trial in zip(state["trial_data"], trials, strict=True):
+        name = _name(trial)
+        if stops.get(name, 0) > trial["config"]["stop_timesteps"]:
+            trial["config"]["stop_timesteps"] = stops[name]
+            if trial["status"] == "TERMINATED":
+                trial["status"] = "PENDING"
+            entry[0] = json.dumps(trial, indent=2)
+            longer.append(name)
+    if longer:
+        _replace(path, state)
+    return longer
+
+
+def _trials(results_dir: Path) -> tuple[Path, dict[str, Any], list[dict[str, Any]]]:
+    """Return the newest state file, what is in it, and the trials in that."""
+    path, tested = _newest(results_dir), ".".join(map(str, TESTED_RAY))
+    if path is None:
+        raise StateError(f"{results_dir} holds no state of Ray Tune (experiment_state-*.json): it cannot be resumed.")
+    state = _read(path)
+    try:
+        trials = [json.loads(trial) for trial, _ in state["trial_data"]]
+        if all({"status", "config"} <= {*trial} and "stop_timesteps" in trial["config"] for trial in trials):
+            return path, state, trials
+    except (TypeError, ValueError, KeyError):
+        pass
+    raise StateError(
+        f"{path} does not look as Ray {tested} writes it (this is Ray {ray.__version__}): install the release that "
+        f"the run was started with."
+    )
+
+
+def _name(trial: Mapping[str, Any]) -> str:
+    return f"{trial['config']['algorithm']}-seed{trial['config']['seed']}"
+
+
+def _newest(results_dir: Path) -> Path | None:
+    return max(results_dir.glob(STATES), default=None)
+
+
+def _replace(path: Path, state: dict[str, Any]) -> None:
+    """Write a state file anew; whatever happens, there is a whole one."""
     changed = path.with_suffix(".new")
     changed.write_text(json.dumps(state, indent=2))
     changed.replace(path)

@@ -1,7 +1,7 @@
 """Rows of a comparison: what an algorithm may have for itself, and what `--quick` makes of it."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -110,6 +110,20 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
     if not isinstance(quick, Mapping):
         raise ValueError(f"Row {name!r}: quick={quick!r} is illegal; legal: a mapping of settings.")
     _check(f"Row {name!r}, quick", quick, training, [])
+
+
+def takes(algorithm: str, name: str) -> bool:
+    """Return whether a row of an algorithm may have a setting, or, with a dotted name, options within it."""
+    setting, dot, _ = name.partition(".")
+    mappings = ("env_config", "train_env_config", "exploration")
+    known = [*OF_THE_TRIAL, *_training_arguments(maobs.ALGORITHMS[algorithm])]
+    return setting in known and bool(dot) == (setting in mappings)
+
+
+def legal_settings(algorithms: Iterable[str]) -> list[str]:
+    """Return what rows of some algorithms may have: of the trial, and of their configs' `training()`."""
+    training = (name for algorithm in algorithms for name in _training_arguments(maobs.ALGORITHMS[algorithm]))
+    return list(dict.fromkeys([*OF_THE_TRIAL, *training]))
 
 
 def _check(owner: str, given: Mapping[str, Any], training: list[str], more: list[str]) -> None:

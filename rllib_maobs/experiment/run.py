@@ -3,9 +3,7 @@
 import logging
 import os
 import shlex
-import shutil
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,18 +16,21 @@ from ray import tune
 
 import rllib_maobs as maobs
 from rllib_maobs.algorithms.checks import check_compiler
-from rllib_maobs.algorithms.settings import without_effect
+from rllib_maobs.algorithms.settings import unheard, without_effect
 from rllib_maobs.checkpoints import saved_networks
-from rllib_maobs.experiment.arguments import has_started, make_parser, parse, save_settings
+from rllib_maobs.experiment.arguments import has_started, make_parser, parse
 from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.claim import claim
+from rllib_maobs.experiment.dashboards import check_dashboards
 from rllib_maobs.experiment.film import film_best
-from rllib_maobs.experiment.progress import ProgressTable, makespan
+from rllib_maobs.experiment.plan import of_one_seed, print_plan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
-from rllib_maobs.experiment.resume import Grid, forget_decisions
-from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row
-from rllib_maobs.experiment.tables import format_table, format_time
-from rllib_maobs.experiment.trial import Pace, Trial, TrialSpec, measure_pace
+from rllib_maobs.experiment.resume import StateError
+from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row, takes
+from rllib_maobs.experiment.search import Search, Space, check_installed
+from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED, Values, check_names, name_of, parse_sweep, points, vary
+from rllib_maobs.experiment.trial import TrialSpec
+from rllib_maobs.experiment.tuning import resume, start
 from rllib_maobs.options import Range, check_value
 
 _LEGAL: dict[str, Any] = {
@@ -144,10 +145,13 @@ class Experiment:
         args = parse(parser, self.name, argv, self.quick_algorithms)
         _quiet()
         try:
+            check_dashboards(args, self.env)
+            if args.search:
+                check_installed()
             specs = self.specs(args)
             if any(spec.torch_compile for spec in specs) and not args.address:
                 check_compiler()
-            for spec in specs[: len(args.algos)]:  # The first seed's: they differ in nothing that could be wrong.
+            for spec in of_one_seed(specs):  # They differ in nothing else that could be wrong.
                 config = spec.build_config()
                 config.validate()
                 if spec.start_from and not args.resume:
@@ -161,6 +165,8 @@ class Experiment:
         try:
             with claimed:
                 code = self._run(args, specs)
+        except StateError as error:
+            sys.exit(f"error: {error}")
         except KeyboardInterrupt:  # While trials run, Tune takes the first one: it saves its state and returns.
             print("\nInterrupted.", f"Go on with: {_resume_command(args)}" if has_started(args.results_dir) else "")
             code = 130
@@ -168,31 +174,100 @@ class Experiment:
             sys.exit(code)
 
     def specs(self, args: Namespace) -> list[TrialSpec]:
-        """Return the trials, seed by seed, so that the first results compare all algorithms."""
-        return [self._spec(args, algorithm, seed) for seed in args.seeds for algorithm in args.algos]
+        """Return the trials, seed by seed, so that the first results compare all algorithms.
 
-    def _spec(self, args: Namespace, algorithm: str, seed: int) -> TrialSpec:
-        """Return one trial: what its row says, and what was given on the command line."""
-        row = self.variants.get(algorithm, {})
-        own = settings_of_row(row, self.stop_timesteps, quick=args.quick)
+        Those of a search are not known before: these are its rows, as they are without it.
+
+        Raises:
+            ValueError: If a sweep has settings that there are not, or a row's settings contradict each other.
+        """
+        rows: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in args.algos]
+        if args.search:
+            self._searched(args)
+        elif args.sweep is not None:
+            rows = self._swept(args)
+        specs = [self._spec(args, name, seed, point) for seed in args.seeds for name, point in rows]
+        if args.lengthened_to and not any(spec.stop_timesteps == args.lengthened_to for spec in specs):
+            least = min(spec.stop_timesteps for spec in specs)
+            raise ValueError(f"--stop-timesteps: {args.lengthened_to:,} is less than the {least:,} that trials have.")
+        return specs
+
+    def _swept(self, args: Namespace) -> list[tuple[str, dict[str, Any]]]:
+        """Return each row with all combinations of the swept settings that mean something to it."""
+        settings = parse_sweep(args.sweep or OF_THE_PAPER, intervals=False)
+        check_names(settings, map(self._algorithm, args.algos))
+        rows, silent = list[tuple[str, dict[str, Any]]](), dict[str, str]()
+        for name in args.algos:
+            taken = {key: values for key, values in settings.items() if takes(self._algorithm(name), key)}
+            for point in points(taken):  # type: ignore[arg-type]  # no intervals
+                heard, ignored = self._heard(args, name, point)
+                silent |= ignored
+                if (name, heard) not in rows:
+                    rows.append((name, heard))
+        without = settings.keys() - set[str]().union(*(point for _, point in rows))
+        if args.sweep and without:
+            raise ValueError("--sweep: " + "; ".join(silent[key] for key in settings if key in without) + ".")
+        return rows
+
+    def _searched(self, args: Namespace) -> dict[str, dict[str, Values]]:
+        """Return where a search looks: the settings that each row takes."""
+        settings = parse_sweep(args.sweep or SEARCHED, intervals=True)
+        check_names(settings, map(self._algorithm, args.algos))
+        rows = {
+            name: {key: values for key, values in settings.items() if takes(self._algorithm(name), key)}
+            for name in args.algos
+        }
+        for name, taken in rows.items():  # What is legal at both ends of a range is so between them.
+            for key, value in ((key, value) for key, values in taken.items() for value in values):
+                self._spec(args, name, args.seeds[0], {key: value}).build_config().validate()
+        return rows
+
+    def _heard(self, args: Namespace, name: str, point: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Split settings into those that have an effect on a row with all of them, and the others, with the reason."""
+        training, _ = self._training(args, name, point)
+        silent = unheard(maobs.ALGORITHMS[self._algorithm(name)]().training(**training))
+        return (
+            {key: value for key, value in point.items() if key not in silent},
+            {key: why for key, why in silent.items() if key in point},
+        )
+
+    def _algorithm(self, name: str) -> str:
+        """Return the algorithm of a row."""
+        algorithm: str = self.variants.get(name, {}).get("algorithm", name)
+        return algorithm
+
+    def _training(self, args: Namespace, name: str, point: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the arguments of `training()` for a row, and all that it has for itself."""
+        row = self.variants.get(name, {})
+        own = vary(settings_of_row(row, self.stop_timesteps, quick=args.quick), point, self.training)
         steps = args.stop_timesteps or own["stop_timesteps"]
         training = {**self.training, "critic_state": args.critic_state}
         training |= {key: value for key, value in own.items() if key not in OF_THE_TRIAL}
-        # A class is a setting, too: of a network, say.
-        depends = {key for key, value in training.items() if callable(value) and not isinstance(value, type)}
-        training = {key: value(steps) if key in depends else value for key, value in training.items()}
+        return {key: value(steps) if _depends(value) else value for key, value in training.items()}, own
+
+    def _spec(
+        self, args: Namespace, name: str, seed: int, point: Mapping[str, Any], sample: int | None = None
+    ) -> TrialSpec:
+        """Return one trial: what its row says, what a sweep changes, and what was given on the command line."""
+        row = self.variants.get(name, {})
+        if point:
+            whole = {key: value for key, value in point.items() if "." not in key}
+            check_row(name, {"algorithm": self._algorithm(name), **whole})
+        training, own = self._training(args, name, point)
+        steps = args.stop_timesteps or own["stop_timesteps"]
         horizon = args.train_horizon or own["train_horizon"]
         # What all rows share need not mean something to each, such as critic_state to IDDPG.
-        config = maobs.ALGORITHMS[row.get("algorithm", algorithm)]().training(**training)
-        unheard = {*without_effect(config)} - {*row}
-        training = {key: value for key, value in training.items() if key not in unheard}
+        config = maobs.ALGORITHMS[self._algorithm(name)]().training(**training)
+        silent = {*without_effect(config)} - {*row}
+        training = {key: value for key, value in training.items() if key not in silent}
         env_config = {**self.env_config, **own["env_config"]}
         return TrialSpec(
-            algorithm=algorithm,
-            variant_of=row.get("algorithm", ""),
+            algorithm=name_of(name, {**point, "sample": sample} if sample else point),
+            variant_of=self._algorithm(name) if point else row.get("algorithm", ""),
             seed=seed,
             env=self.env,
-            stop_timesteps=steps,
+            # Rates that fall with the length of a trial are made for its first length.
+            stop_timesteps=max(steps, args.lengthened_to or 0),
             training=training,
             env_config={**env_config, **own["train_env_config"], "horizon": horizon},
             evaluation_env_config={
@@ -206,6 +281,7 @@ class Experiment:
             steps_per_iteration=own["steps_per_iteration"],
             evaluation_duration=own["evaluation_duration"],
             start_from=args.start_from or "",
+            varied=dict(point),
         )
 
     def _run(self, args: Namespace, specs: list[TrialSpec]) -> int:
@@ -216,73 +292,47 @@ class Experiment:
             args.results_dir.mkdir(parents=True, exist_ok=True)
             if args.resume:
                 print(f"Resuming {self.name} in {args.results_dir}", flush=True)
-                forget_decisions(args.results_dir)
-                tuner = tune.Tuner.restore(str(args.results_dir), trainable=Trial, resume_errored=True)
+                if args.lengthened_to:
+                    self._print_kept(args)
             else:
                 self._print_plan(args, specs)
-                tuner = _make_tuner(self.name, args, specs)
-            trials = tuner.fit()
+            search = self._search(args) if args.search else None
+            trials = resume(self.name, args, specs, search) if args.resume else start(self.name, args, specs, search)
         finally:
             if started:
                 ray.shutdown()
+        if args.search:  # Only now it is known which trials there are.
+            specs = [TrialSpec(**trial.config) for trial in trials if trial.config]
         return self._report(args, trials, specs)
+
+    def _print_kept(self, args: Namespace) -> None:
+        """Say which settings of longer trials were made for their first length."""
+        for name in args.algos:
+            row = self.variants.get(name, {})
+            own = {**self.training, **settings_of_row(row, self.stop_timesteps, quick=args.quick)}
+            if (args.stop_timesteps or own["stop_timesteps"]) < args.lengthened_to:
+                if kept := [key for key, value in own.items() if key not in OF_THE_TRIAL and _depends(value)]:
+                    print(f"{name}: {', '.join(kept)} fall as in the first run, and stay where they ended there.")
+
+    def _search(self, args: Namespace) -> Search:
+        """Return Optuna's search among the rows and the settings of --sweep."""
+
+        def make_config(sample: int, name: str, point: dict[str, Any]) -> dict[str, Any]:
+            heard, _ = self._heard(args, name, point)
+            return asdict(self._spec(args, name, args.seeds[0], heard, sample))
+
+        return Search(Space(self._searched(args)), make_config, seed=args.seeds[0], resumed=args.resume)
 
     def _print_plan(self, args: Namespace, specs: list[TrialSpec]) -> None:
         """Say what will be run, what it will take and where it will be found."""
-        rows = {spec.algorithm: spec for spec in specs[: len(args.algos)]}
-        print(f"{self.name}: {len(specs)} trials, {', '.join(rows)} with seed {', '.join(map(str, args.seeds))}")
-        left_out = [name for name in self.algorithms if name not in rows]
-        if args.quick and left_out and set(rows) == set(self.quick_algorithms):
-            print(
-                f"--quick trains {' and '.join(rows)} only: {', '.join(left_out)} need hours to show anything (name "
-                f"them with --algos, or leave --quick out)."
+        left_out = [name for name in self.algorithms if name not in args.algos]
+        note = ""
+        if args.quick and left_out and set(args.algos) == set(self.quick_algorithms):
+            note = (
+                f"--quick trains {' and '.join(args.algos)} only: {', '.join(left_out)} need hours to show anything "
+                f"(name them with --algos, or leave --quick out)."
             )
-        pace: dict[str, Pace] = {}
-        # A quick run of its own size takes minutes: to measure how many would compile everything once more.
-        if args.quick and args.stop_timesteps is None and len(args.seeds) == 1:
-            estimate = "Estimated: at most about five minutes on two free cores; in a quick run nothing is measured."
-        else:
-            pace, estimate = self._measured(args, specs)
-        header = ["algorithm", "env steps", "updates per env step"]
-        cells = [
-            [name, f"{spec.stop_timesteps:,}", f"{spec.build_config().updates_per_env_step:g}"]
-            for name, spec in rows.items()
-        ]
-        if pace:
-            header += ["env steps/s", "time per trial"]
-            for (name, spec), row in zip(rows.items(), cells, strict=True):
-                speed = pace[name].env_steps_per_s
-                row += [f"{speed:.0f}", format_time(spec.stop_timesteps / speed)]
-        print(
-            f"\n{format_table(header, cells)}\n\n{estimate}\n"
-            f"Results: {args.results_dir}\n"
-            f"TensorBoard: tensorboard --logdir {shlex.quote(str(args.results_dir))}\n"
-            f"Ctrl-C stops; then --resume goes on from the last checkpoints.\n",
-            flush=True,
-        )
-
-    def _measured(self, args: Namespace, specs: list[TrialSpec]) -> tuple[dict[str, Pace], str]:
-        """Measure the pace of each algorithm; return it, and what it says of the whole run."""
-        compiles = any(spec.torch_compile for spec in specs)
-        print(f"Measuring how fast that is here{' (and compiling)' if compiles else ''} ...", flush=True)
-        start = time.monotonic()
-        cores = int(ray.available_resources().get("CPU", 0))
-        at_once = max(1, min(cores // (1 + args.num_env_runners), len(specs)))
-        pace = _measure(specs[: len(args.algos)], at_once, seconds=2.0 if args.quick else 10.0)
-        total = makespan([spec.stop_timesteps / pace[spec.algorithm].env_steps_per_s for spec in specs], at_once)
-        megabytes = max(
-            min(spec.stop_timesteps, spec.build_config().replay_buffer_capacity)
-            * pace[spec.algorithm].bytes_per_env_step
-            / 1e6
-            for spec in specs[: len(args.algos)]
-        )
-        return pace, (
-            f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
-            f"compiling.\n"
-            f"Estimated: {total / 3600:.2f} hours for all, {at_once} at once.\n"
-            f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and as much of disk in its checkpoint; "
-            f"free disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB."
-        )
+        print_plan(self.name, args, specs, note)
 
     def _report(self, args: Namespace, trials: tune.ResultGrid, specs: list[TrialSpec]) -> int:
         """Write and print the results, and film the best; return the exit code."""
@@ -299,15 +349,24 @@ class Experiment:
             print(error)
         for path in failed:
             print(f"FAILED: {path.name}, see {path / 'error.txt'}")
+        # Trials that a search has stopped early are done, too.
         stops = {spec.name: spec.stop_timesteps for spec in specs}
-        finished = sum((trial.metrics or {}).get(STEPS, 0) >= stops[Path(trial.path).name] for trial in trials)
-        if finished + len(failed) < len(specs):
+        metrics = [(Path(trial.path).name, trial.metrics or {}) for trial in trials]
+        finished = sum(
+            bool(result.get("done")) if args.search else result.get(STEPS, 0) >= stops[name] for name, result in metrics
+        )
+        if finished + len(failed) < (args.num_samples if args.search else len(specs)):
             print(f"Interrupted. Go on with: {_resume_command(args)}")
             return 130
         if failed:
             print(f"Try them again, from their last checkpoints, with: {_resume_command(args)}")
             return 1
         return 0
+
+
+def _depends(setting: Any) -> bool:
+    """Return whether a setting is a function of the trial's env steps; a class is a setting, too: of a network, say."""
+    return callable(setting) and not isinstance(setting, type)
 
 
 def _quiet() -> None:
@@ -344,44 +403,6 @@ def _start_ray(args: Namespace) -> bool:
         logging_level=logging.ERROR,
     )
     return True
-
-
-def _make_tuner(name: str, args: Namespace, specs: list[TrialSpec]) -> tune.Tuner:
-    save_settings(name, args)
-    return tune.Tuner(
-        Trial,
-        param_space=tune.grid_search([asdict(spec) for spec in specs]),
-        tune_config=tune.TuneConfig(
-            search_alg=Grid(), trial_name_creator=_trial_name, trial_dirname_creator=_trial_name
-        ),
-        run_config=tune.RunConfig(
-            name=args.results_dir.name,
-            storage_path=str(args.results_dir.parent),
-            checkpoint_config=tune.CheckpointConfig(
-                checkpoint_frequency=args.checkpoint_freq, checkpoint_at_end=True, num_to_keep=1
-            ),
-            progress_reporter=ProgressTable(every_s=10.0 if args.quick else 30.0),
-            verbose=1,
-        ),
-    )
-
-
-def _trial_name(trial: Any) -> str:
-    return f"{trial.config['algorithm']}-seed{trial.config['seed']}"
-
-
-def _measure(specs: Sequence[TrialSpec], at_once: int, seconds: float) -> dict[str, Pace]:
-    """Measure the pace of each algorithm with so many at once as there will be trials."""
-    measure = ray.remote(num_cpus=1)(measure_pace)
-    pace: dict[str, Pace] = {}
-    waiting, running = list(specs), dict[Any, str]()
-    while waiting or running:
-        while waiting and len(running) < at_once:
-            spec = waiting.pop(0)
-            running[measure.remote(spec, seconds)] = spec.algorithm
-        (done,), _ = ray.wait(list(running))
-        pace[running.pop(done)] = ray.get(done)
-    return pace
 
 
 def _resume_command(args: Namespace) -> str:

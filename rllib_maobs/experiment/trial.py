@@ -1,6 +1,7 @@
 """One trial of an experiment: an algorithm, a seed and plain settings, run under Ray Tune."""
 
 import contextlib
+import math
 import os
 import time
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from ray import tune
 from ray.rllib.algorithms import AlgorithmConfig
 
 import rllib_maobs as maobs
-from rllib_maobs.experiment.report import STEPS
+from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
 
 SHARED_POLICY = "all"
 # What Tune fills in by itself for the trial; the algorithm inside fills in its own, with a config of a thousand lines.
@@ -52,6 +53,7 @@ class TrialSpec:
         evaluation_duration: Episodes per evaluation.
         variant_of: The algorithm, if `algorithm` names a variant of it.
         start_from: Checkpoint whose networks it starts from; "" for new ones.
+        varied: What a sweep or a search has changed for this one, by name of the setting.
     """
 
     algorithm: str
@@ -69,6 +71,7 @@ class TrialSpec:
     evaluation_duration: int = 10
     variant_of: str = ""
     start_from: str = ""
+    varied: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -141,7 +144,9 @@ class Trial(tune.Trainable):
             maobs.load_networks(self._algorithm, self._start_from)
             self._start_from = ""
         result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
-        return {**result, "done": result[STEPS] >= self._stop_timesteps}
+        # By this name a search finds it; NaN, which no trial is kept for, if no episode has ended.
+        score = evaluation_metrics(result).get(SCORE, math.nan)
+        return {**result, SCORE: score, "done": result[STEPS] >= self._stop_timesteps}
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""
