@@ -182,8 +182,8 @@ def make_parser(
     where.add_argument(
         "--checkpoint-freq",
         type=positive,
-        default=50,
-        help="iterations (of 1000 env steps, or what a row has for itself) between checkpoints",
+        help="iterations (of 1000 env steps, or what a row has for itself) between checkpoints (default: as many as "
+        "make 50,000 env steps)",
     )
     where.add_argument(
         "--resume",

@@ -33,6 +33,7 @@ from rllib_maobs.experiment.trial import TrialSpec
 from rllib_maobs.experiment.tuning import resume, start
 from rllib_maobs.options import Range, check_value
 
+BETWEEN_CHECKPOINTS = 50_000  # env steps
 _LEGAL: dict[str, Any] = {
     "name": str,
     "env": str,
@@ -281,6 +282,7 @@ class Experiment:
             steps_per_iteration=own["steps_per_iteration"],
             evaluation_duration=own["evaluation_duration"],
             start_from=args.start_from or "",
+            checkpoint_freq=args.checkpoint_freq or max(1, BETWEEN_CHECKPOINTS // own["steps_per_iteration"]),
             varied=dict(point),
         )
 

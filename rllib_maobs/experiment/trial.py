@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from ray import tune
 from ray.rllib.algorithms import AlgorithmConfig
+from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
@@ -53,6 +54,7 @@ class TrialSpec:
         evaluation_duration: Episodes per evaluation.
         variant_of: The algorithm, if `algorithm` names a variant of it.
         start_from: Checkpoint whose networks it starts from; "" for new ones.
+        checkpoint_freq: Iterations between checkpoints.
         varied: What a sweep or a search has changed for this one, by name of the setting.
     """
 
@@ -71,6 +73,7 @@ class TrialSpec:
     evaluation_duration: int = 10
     variant_of: str = ""
     start_from: str = ""
+    checkpoint_freq: int = 50
     varied: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -136,6 +139,7 @@ class Trial(tune.Trainable):
         """Build the algorithm."""
         spec = TrialSpec(**config)
         self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
+        self._checkpoint_freq = spec.checkpoint_freq
         self._algorithm = _build(spec.build_config())
 
     def step(self) -> dict[str, Any]:
@@ -146,7 +150,9 @@ class Trial(tune.Trainable):
         result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
         # By this name a search finds it; NaN, which no trial is kept for, if no episode has ended.
         score = evaluation_metrics(result).get(SCORE, math.nan)
-        return {**result, SCORE: score, "done": result[STEPS] >= self._stop_timesteps}
+        # Tune's own frequency is one for all trials, whose iterations differ in length.
+        save = (self.iteration + 1) % self._checkpoint_freq == 0
+        return {**result, SCORE: score, SHOULD_CHECKPOINT: save, "done": result[STEPS] >= self._stop_timesteps}
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""

@@ -40,7 +40,7 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
     run_config = tune.RunConfig(
         name=args.results_dir.name,
         storage_path=str(args.results_dir.parent),
-        checkpoint_config=_checkpoints(args),
+        checkpoint_config=_checkpoints(),
         progress_reporter=_progress(args),
         callbacks=make_callbacks(name, args),
         verbose=1,
@@ -86,7 +86,7 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         config=_grid(others) if others else {},
         num_samples=args.num_samples if search else 1,
         storage_path=str(args.results_dir.parent),
-        checkpoint_config=_checkpoints(args),
+        checkpoint_config=_checkpoints(),
         trial_name_creator=_trial_name,
         trial_dirname_creator=_trial_name,
     )
@@ -120,8 +120,8 @@ def _scheduler(search: Search | None, specs: Sequence[TrialSpec]) -> Any:
     return stopping(max(spec.stop_timesteps for spec in specs)) if search else None
 
 
-def _checkpoints(args: Namespace) -> tune.CheckpointConfig:
-    return tune.CheckpointConfig(checkpoint_frequency=args.checkpoint_freq, checkpoint_at_end=True, num_to_keep=1)
+def _checkpoints() -> tune.CheckpointConfig:
+    return tune.CheckpointConfig(checkpoint_at_end=True, num_to_keep=1)  # and whenever a trial asks for one
 
 
 def _progress(args: Namespace) -> ProgressTable:
