@@ -77,6 +77,16 @@ def test_defaults_are_never_refused(algorithm: str) -> None:
     assert evaluation.batch_mode != config.batch_mode  # which is RLlib's doing, and no error
 
 
+@pytest.mark.parametrize(
+    ("given", "explores"), [(None, False), ({"num_envs_per_env_runner": 3}, False), ({"explore": True}, True)]
+)
+def test_evaluation_explores_only_if_told_to(given: dict[str, Any] | None, explores: bool) -> None:
+    config = maobs.MADDPGConfig().environment("maobs/spread-3a").evaluation(evaluation_config=given)
+    assert config.get_evaluation_config_object().explore is explores
+    assert config.explore is True
+    config.validate()
+
+
 # Wrong settings, in one sentence each.
 
 

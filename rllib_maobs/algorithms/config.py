@@ -127,7 +127,6 @@ class JointConfig(AlgorithmConfig):
         self.num_envs_per_env_runner = 8
         self.rollout_fragment_length = "auto"
         self.min_sample_timesteps_per_iteration = 1000
-        self.evaluation_config = AlgorithmConfig.overrides(explore=False)
 
     @override(AlgorithmConfig)
     def training(
@@ -247,6 +246,14 @@ class JointConfig(AlgorithmConfig):
     learners = _checked(AlgorithmConfig.learners)
     evaluation = _checked(AlgorithmConfig.evaluation)
     multi_agent = _checked(AlgorithmConfig.multi_agent)
+
+    @override(AlgorithmConfig)
+    def get_evaluation_config_object(self) -> JointConfig | None:
+        """The config of the runners that evaluate; they explore only if `evaluation_config` says so itself."""
+        evaluation = super().get_evaluation_config_object()
+        if evaluation is not None and "explore" not in (self.evaluation_config or {}):
+            evaluation.explore = False
+        return evaluation
 
     @override(AlgorithmConfig)
     def validate(self) -> None:

@@ -158,7 +158,9 @@ HONOURED: dict[str, str] = {
     # evaluation
     **_each("evaluation_interval evaluation_duration evaluation_duration_unit"),
     **_each(
-        "evaluation_config", "settings of the runners that evaluate; others would do nothing there, and are errors"
+        "evaluation_config",
+        "settings of the runners that evaluate; others would do nothing there, and are errors; without `explore` they "
+        "do not explore",
     ),
     **_each("evaluation_auto_duration_min_env_steps_per_sample evaluation_auto_duration_max_env_steps_per_sample"),
     **_each("evaluation_sample_timeout_s evaluation_num_env_runners evaluation_unhealthy_workers_timeout_s"),
