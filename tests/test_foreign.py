@@ -17,9 +17,10 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.env.env_context import EnvContext
 from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 
-from rllib_maobs.envs.joint import StackedEnv, WithAgentIds, make_joint_env
+from rllib_maobs.envs.joint import StackedEnv, make_joint_env
 from rllib_maobs.envs.snapshot import snapshot
 from rllib_maobs.envs.team import Team, finished, shares_reward
+from rllib_maobs.envs.wrappers import WithAgentIds
 from rllib_maobs.modules.exploration import EpsilonGaussian
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointEnvRunner

@@ -19,8 +19,9 @@ from rllib_maobs.envs import (
     parallel_env,
     split,
 )
-from rllib_maobs.envs.joint import StackedEnv, WithAgentIds, make_joint_env
+from rllib_maobs.envs.joint import StackedEnv, make_joint_env
 from rllib_maobs.envs.team import Team
+from rllib_maobs.envs.wrappers import WithAgentIds
 from rllib_maobs.layout import as_layout, flat, layout_size
 
 PREY = "obstacle-predator-prey"

@@ -8,8 +8,9 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.env.env_context import EnvContext
 from ray.tune.registry import ENV_CREATOR, _global_registry
 
-from rllib_maobs.envs.joint import InOrder, WithAgentIds, make_joint_env, register_envs
+from rllib_maobs.envs.joint import make_joint_env, register_envs
 from rllib_maobs.envs.team import JointEnv, Team
+from rllib_maobs.envs.wrappers import InOrder, WithAgentIds
 
 
 def env_creator(config: AlgorithmConfig) -> Any:
