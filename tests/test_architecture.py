@@ -15,7 +15,7 @@ ALLOWED = {
     "registry": {"options"},
     "envs": FOUNDATION,
     "modules": FOUNDATION,
-    "replay": set(),
+    "replay": {"options"},
     "runner": {*FOUNDATION, "envs", "modules"},
     "learner": {*FOUNDATION, "modules", "replay"},
     "algorithms": {*FOUNDATION, "envs", "modules", "replay", "runner", "learner"},

@@ -454,7 +454,7 @@ def test_commands_take_files_with_the_options_inside(
         [str(files["shared.onnx"]), "--num-agents", "2", "--episodes", "2", "--json", str(table), "horizon=5"]
     )
     rows = {row["policy"]: row for row in json.loads(table.read_text())}
-    assert set(rows) == {"random", "heuristic", "shared.onnx"} and rows["shared.onnx"]["agents"] == 2
+    assert set(rows) == {"random", "heuristic", "orca", "shared.onnx"} and rows["shared.onnx"]["agents"] == 2
 
 
 def test_what_a_file_does_not_fit_is_said(files: dict[str, Path]) -> None:
