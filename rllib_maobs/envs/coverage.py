@@ -14,6 +14,7 @@ from rllib_maobs.layout import Entities, Layout, split
 from rllib_maobs.options import Range
 
 Positive = Range(0.0, exclusive=True)
+MOST = 1000  # bodies of a kind; every pair of bodies takes some bytes in every copy
 TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
 
 
@@ -21,7 +22,7 @@ TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
 class TargetOptions(ScenarioOptions):
     """Options of tasks with one target for every agent, documented in these tasks."""
 
-    num_agents: Annotated[int, Range(1)] = 3
+    num_agents: Annotated[int, Range(1, MOST)] = 3
     agent_radius: Annotated[float, Positive] = 0.15
     obstacle_radius: Annotated[float, Positive] = 0.1
     goal_radius: Annotated[float, Positive] = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.coverage import Positive, others
+from rllib_maobs.envs.coverage import MOST, Positive, others
 from rllib_maobs.envs.placement import Placement
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
 from rllib_maobs.envs.steering import steer, thrust
@@ -21,8 +21,8 @@ from rllib_maobs.options import Range
 class PredatorPreyOptions(ScenarioOptions):
     """Options of `PredatorPrey`, documented there."""
 
-    num_predators: Annotated[int, Range(1)] = 3
-    num_obstacles: Annotated[int, Range(0)] = 2
+    num_predators: Annotated[int, Range(1, MOST)] = 3
+    num_obstacles: Annotated[int, Range(0, MOST)] = 2
     prey: Literal["random", "flee", "learned"] = "random"
     predator_radius: Annotated[float, Positive] = 0.075
     prey_radius: Annotated[float, Positive] = 0.05

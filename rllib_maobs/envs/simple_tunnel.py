@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.coverage import TARGET_RADIUS, Positive, others, share_rewards
+from rllib_maobs.envs.coverage import MOST, TARGET_RADIUS, Positive, others, share_rewards
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.scenario import Outcome, Scenario
 from rllib_maobs.envs.steering import take_turns, thrust
@@ -23,7 +23,7 @@ class SimpleTunnelOptions(GapOptions):
     """Options of `SimpleTunnel`, documented there."""
 
     reward_mode: Literal["sum", "mean", "individual"] = "individual"
-    num_columns: Annotated[int, Range(1)] = 1
+    num_columns: Annotated[int, Range(1, MOST)] = 1
     column_spacing: Annotated[float, Positive] = 0.25
     wall_x: Annotated[float, Positive] = 1.4
     wall_y: Annotated[float, Positive] = 1.0

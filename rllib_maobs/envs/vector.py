@@ -83,7 +83,10 @@ class VectorEnv:
         self._actions_shape = (num_envs, n, *action_shape)
         self._discrete = scenario.options.action_mode == "discrete"
 
-        self.world = scenario.make_world(num_envs)
+        try:
+            self.world = scenario.make_world(num_envs)
+        except MemoryError as error:
+            raise ValueError(f"num_envs={num_envs}: so many copies do not fit into memory ({error})") from None
         accel = [g.accel for g in self.world.groups if g.movable for _ in range(g.count)]
         self._accel = np.array(accel)[:, None]
         self.seeds: NDArray[np.int64] = np.full(num_envs, -1, np.int64)
