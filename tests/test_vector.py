@@ -104,7 +104,7 @@ def test_actions_accelerate(mode, action, force):
 
 
 def test_more_than_fits_into_memory():
-    with pytest.raises(ValueError, match="^num_envs=1000000000000: so many copies do not fit into memory"):
+    with pytest.raises(ValueError, match=r"^num_envs=1000000000000: so many copies do not fit into memory"):
         make_vec("spread-3a", num_envs=10**12)
-    with pytest.raises(ValueError, match="num_agents=1000000000 is illegal; legal: an integer >= 1 and <= 1000$"):
+    with pytest.raises(ValueError, match=r"num_agents=1000000000 is illegal; legal: an integer >= 1 and <= 1000$"):
         make_vec("spread-3a", num_agents=10**9)
