@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
@@ -408,6 +409,9 @@ class JointLearner(TorchLearner):
 
         Returns:
             RLlib's reduced metrics, or None if there was no update.
+
+        Raises:
+            FloatingPointError: If a loss or a value was not finite.
         """
         if self._sum is None:
             return None
@@ -415,6 +419,8 @@ class JointLearner(TorchLearner):
         for (name, count), values in zip(counts.items(), self._sum.tolist(), strict=False):
             by_module: dict[str, list[float]] = {}
             for mid, value in zip(self.config.module_ids, values, strict=True):
+                if not math.isfinite(value):
+                    raise FloatingPointError(self._diverged(mid, name, value))
                 by_module.setdefault(mid, []).append(value / count)
             for mid, of_agents in by_module.items():
                 self.metrics.log_value((mid, name), sum(of_agents) / len(of_agents), window=1)
@@ -423,6 +429,15 @@ class JointLearner(TorchLearner):
         self._env_steps = (timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
+
+    def _diverged(self, module_id: str, name: str, value: float) -> str:
+        """What is said when training has come to nothing; the checkpoint before it is still good."""
+        last = self._updates_lifetime
+        return (
+            f"{name} of {module_id} is {value} in one of updates {last - self._updates + 1} to {last}: training has "
+            f"diverged. Go on from a checkpoint made before, or begin anew, with a lower critic_lr or actor_lr, with "
+            f"grad_clip, or with a smaller reward_scale."
+        )
 
     def update_normalizers(self, observations: NDArray[np.float32]) -> None:
         """Takes newly sampled observations `(..., N, O)` into the running normalisation, if there is one."""
