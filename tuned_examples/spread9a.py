@@ -32,12 +32,7 @@ experiment = Experiment(
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),
             "env_config": {"action_mode": "force"},
-            # Scores are those of the task's own reward: the sum, with contacts at a third of this price.
-            "train_env_config": {
-                "reward_mode": "mean",
-                "agent_collision_penalty": 3.0,
-                "obstacle_collision_penalty": 3.0,
-            },
+            "train_env_config": {"reward_mode": "mean"},  # scores are those of the task's own reward, the sum
             "train_horizon": 25,
             "num_envs_per_env_runner": 32,
             "stop_timesteps": 300_000,
@@ -45,7 +40,6 @@ experiment = Experiment(
                 "stop_timesteps": 48_000,
                 "steps_per_iteration": 4_000,
                 "evaluation_duration": 20,
-                "train_env_config": {"reward_mode": "mean"},  # so few steps are for covering targets
                 "torch_compile": True,
             },
         },

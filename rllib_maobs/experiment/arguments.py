@@ -97,6 +97,7 @@ def make_parser(
     )
     positive, natural, seed = _whole_number(1), _whole_number(0), _whole_number(0, 2**32 - 1)
     parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
+    parser.set_defaults(lengthened_to=None)  # env steps of a finished run that goes on, see `parse`
     what = parser.add_argument_group("what to train")
     what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
     what.add_argument(
@@ -235,7 +236,6 @@ def parse(
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
     args.resume = args.resume or bool(args.add_seeds or args.add_algos)
-    args.lengthened_to = None
     if args.resume:
         if not has_started(results_dir) or not (results_dir / _FILE).is_file():
             parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
