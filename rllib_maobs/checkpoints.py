@@ -33,9 +33,11 @@ def find_checkpoint(path: str | Path) -> Path:
     for found in (folder, *sorted(folder.glob("checkpoint_*"), reverse=True)):
         if found.joinpath(*_MODULES).is_dir():
             return found
+    trials = sorted({str(trial.parent.name) for trial in folder.glob("*/checkpoint_*")}) if folder.is_dir() else []
+    inside = f" Trials in it are {', '.join(trials)}." if trials else ""
     raise ValueError(
         f"{str(path)!r} is no checkpoint; legal: the folder of an RLlib algorithm checkpoint (with modules in "
-        f"{'/'.join(_MODULES)}), or of a trial with checkpoints."
+        f"{'/'.join(_MODULES)}), or of a trial with checkpoints.{inside}"
     )
 
 

@@ -149,6 +149,8 @@ def jobs_of(
     Raises:
         ValueError: If the checkpoint, the environment or an option is illegal, or they do not fit.
     """
+    if checkpoint in BASELINES:
+        raise ValueError(f"{checkpoint} comes by itself beside every checkpoint: give the folder of a checkpoint")
     trained, _ = trained_on(checkpoint)
     if env is None and trained not in SCENARIOS:
         raise ValueError(f"{checkpoint!r} was trained on {trained}; give --env, one of {', '.join(SCENARIOS)}")

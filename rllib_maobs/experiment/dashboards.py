@@ -1,5 +1,6 @@
 """What dashboards show of a trial: few curves with plain names over env steps, its settings, and films."""
 
+import math
 import os
 from argparse import Namespace
 from collections.abc import Iterator, Mapping
@@ -100,7 +101,8 @@ def curves_of(result: Mapping[str, Any]) -> dict[str, float]:
     curves["speed/seconds_per_iteration"] = result["time_this_iter_s"]
     curves["speed/env_steps_per_s"] = result["env_runners"]["num_env_steps_sampled"] / result["time_this_iter_s"]
     curves["speed/hours"] = result["time_total_s"] / 3600
-    return {name: float(value) for name, value in curves.items()}
+    # What has no value yet (no episode has ended, no update was made) is left out: loggers complain of NaN.
+    return {name: float(value) for name, value in curves.items() if math.isfinite(value)}
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:

@@ -20,8 +20,8 @@ _DECISIONS = "_cached_trial_decisions"
 
 
 NOT_RESTORED = (
-    "Ray Tune could not restore the state of this run (see the log above); nothing was started or written over: try "
-    "again, or restore the folder from a copy"
+    "Ray Tune could not restore the state of this run (see the log above); nothing was started or written over: go on "
+    "with the version of this package that began it, try again, or restore the folder from a copy"
 )
 
 
