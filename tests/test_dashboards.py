@@ -51,6 +51,12 @@ def result(steps: int) -> dict[str, Any]:
     }
 
 
+def test_what_has_no_value_yet_is_no_point_of_a_curve() -> None:
+    early = result(100)
+    early["env_runners"]["episode_metrics"]["coverage"] = float("nan")
+    assert {*curves_of(result(100))} - {*curves_of(early)} == {"train/coverage"}
+
+
 def test_curves_are_grouped_and_named() -> None:
     assert curves_of(result(100)) == {
         "evaluation/score": -3.0,

@@ -134,7 +134,13 @@ def test_mistakes_end_in_a_sentence(
 
 
 def test_what_is_no_checkpoint_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, message in (([tmp_path], "is no checkpoint; legal:"), (["horizon=3"], "nothing to evaluate")):
+    (tmp_path / "results" / "maddpg-seed0" / "checkpoint_000001").mkdir(parents=True)
+    for arguments, message in (
+        ([tmp_path], "is no checkpoint; legal:"),
+        ([tmp_path / "results"], "or of a trial with checkpoints. Trials in it are maddpg-seed0."),
+        (["heuristic"], "heuristic comes by itself beside every checkpoint"),
+        (["horizon=3"], "nothing to evaluate"),
+    ):
         with pytest.raises(SystemExit):
             run(*arguments)
         assert message in capsys.readouterr().err
