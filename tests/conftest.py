@@ -1,11 +1,13 @@
 """What several test files share."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 import ray
 import torch
+from hypothesis import HealthCheck, settings
 
 import rllib_maobs as maobs
 from rllib_maobs.learner import JointLearner
@@ -14,6 +16,55 @@ from rllib_maobs.replay import Batch, Moment
 torch.set_num_threads(1)
 
 ALGORITHMS = sorted(maobs.ALGORITHMS)
+FAULTS = "tests/faults/"
+TALLY = "tally: "
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """`pytest -m faults` is the long form of tests/faults; every other run has a short one."""
+    common: dict[str, Any] = {"deadline": None, "suppress_health_check": [*HealthCheck], "database": None}
+    settings.register_profile("short", max_examples=25, derandomize=True, **common)
+    settings.register_profile("long", max_examples=1000, **common)
+    settings.load_profile("long" if is_long(config) else "short")
+
+
+def is_long(config: pytest.Config) -> bool:
+    """Whether `-m faults` was given."""
+    return "faults" in (config.getoption("markexpr") or "").replace("not faults", "")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """All tests in tests/faults are of that kind."""
+    for item in items:
+        if item.nodeid.startswith(FAULTS):
+            item.add_marker("faults")
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print what the tests of faults have counted."""
+    counts: Counter[str] = Counter()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        if getattr(report, "when", "") == "teardown":
+            counts.update({k.removeprefix(TALLY): v for k, v in report.user_properties if k.startswith(TALLY)})
+    if counts:
+        terminalreporter.section("faults")
+        for name, count in sorted(counts.items()):
+            terminalreporter.line(f"{count:>12,} {name}")
+
+
+@pytest.fixture
+def long(pytestconfig: pytest.Config) -> bool:
+    """Whether this is the long form of the tests of faults."""
+    return is_long(pytestconfig)
+
+
+@pytest.fixture
+def tally(record_property: Callable[[str, object], None]) -> Iterator[Counter[str]]:
+    """Counts for the summary at the end of the run, by what is counted: `tally["kills survived"] += 1`."""
+    counts: Counter[str] = Counter()
+    yield counts
+    for name, count in counts.items():
+        record_property(TALLY + name, count)
 
 
 @pytest.fixture(scope="session")
