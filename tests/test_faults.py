@@ -250,9 +250,7 @@ def test_training_that_diverges_ends(ray_session: None) -> None:
     """The squares of such rewards are infinite in single precision; agents' losses are told apart."""
     algo = small_config("maddpg").training(reward_scale=1e25).build_algo()
     try:
-        message = (
-            r"^critic_loss of agent_0 is inf in one of updates 1 to \d+: training has diverged\. .* lower critic_lr"
-        )
+        message = r"^critic_loss of agent_0 is inf in update \d+: training has diverged\. .* lower critic_lr"
         with pytest.raises(FloatingPointError, match=message):
             for _ in range(3):
                 algo.train()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import pickle
 from collections.abc import Collection
@@ -14,6 +15,7 @@ from pyarrow.fs import FileSystem, FileType
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import (
+    ALL_MODULES,
     COMPONENT_LEARNER,
     COMPONENT_LEARNER_GROUP,
     COMPONENT_METRICS_LOGGER,
@@ -37,16 +39,18 @@ from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 from rllib_maobs.algorithms.checks import check_machine
 from rllib_maobs.algorithms.config import JointConfig
 from rllib_maobs.envs.team import REWARD_TOLERANCE, Team
-from rllib_maobs.learner import JointLearner
+from rllib_maobs.learner import Diverged, JointLearner
 from rllib_maobs.paths import AnyPath, absolute
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raise_kept, raised_as_themselves
 
+logger = logging.getLogger(__name__)
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many. Those of long windows are
 # larger, so there are fewer.
 _ROWS_PER_DRAW = 16_384
 _LONG_WINDOW = 32
+_FAR_BEYOND = 2.0  # networks overshoot a little while they learn
 
 
 class JointAlgorithm(AnyPath, Algorithm):
@@ -94,11 +98,13 @@ class JointAlgorithm(AnyPath, Algorithm):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
         self._rounds_without_samples = 0
+        self._warned_of_values = False
         self._custom_metrics: dict[str, Any] = {}
         self._progress: dict[str, Any] = {
             "env_steps": 0,
             "updates": 0,
             "learning_starts": self._steps_before_learning(),
+            "largest_reward": 0.0,
         }
         self._progress["updates_per_env_step"] = self.config.updates_per_env_step
 
@@ -126,6 +132,8 @@ class JointAlgorithm(AnyPath, Algorithm):
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_ADD_DATA_TIMER)):
                 for sample in samples:
                     self._check_reward(sample)
+                    largest = float(np.abs(sample.rewards).max(initial=self._progress["largest_reward"]))
+                    self._progress["largest_reward"] = largest
                     self.replay_buffer.add(**vars(sample))
                     self._learner.update_normalizers(sample.obs)
                     self._progress["env_steps"] += sample.env_steps()
@@ -216,7 +224,11 @@ class JointAlgorithm(AnyPath, Algorithm):
                 )
             with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
                 timesteps = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self._progress["env_steps"]}
-                self.learner_group.update(batch=batch, timesteps=timesteps, _no_metrics_reduce=True)
+                try:
+                    self.learner_group.update(batch=batch, timesteps=timesteps, _no_metrics_reduce=True)
+                except Diverged as error:
+                    error.keep(self.logdir)
+                    raise
             left -= count
         self._progress["updates"] += max(0, owed)
         return owed
@@ -238,6 +250,22 @@ class JointAlgorithm(AnyPath, Algorithm):
         report = self._learner.report(timesteps=timesteps)
         if report is not None:
             self.metrics.aggregate([report], key=LEARNER_RESULTS)
+            self._check_values()
+
+    def _check_values(self) -> None:
+        """Reports the largest return there can be, by the rewards seen so far; warns once of values far beyond it."""
+        config, largest = self.config, self._progress["largest_reward"]
+        if config.gamma == 1.0 or not largest:
+            return
+        limit = largest * config.reward_scale / (1.0 - config.gamma)
+        self.metrics.log_value((LEARNER_RESULTS, ALL_MODULES, "q_limit"), limit, window=1)
+        if self._learner.q_max > _FAR_BEYOND * limit and not self._warned_of_values:
+            self._warned_of_values = True
+            logger.warning(
+                f"Values diverge: |Q| comes to {self._learner.q_max:.3g} after {self._progress['env_steps']:,} env "
+                f"steps, and no return can be larger than {limit:.3g} (the largest reward so far, {largest:.3g}, at "
+                f"every step). A lower critic_lr or tau, grad_clip or a smaller reward_scale may help."
+            )
 
     def _follow(self, saved: Team | None) -> None:
         """Builds everything anew if a saved team, whose state is to be taken over, stands in another order.
@@ -324,7 +352,7 @@ class JointAlgorithm(AnyPath, Algorithm):
         if COMPONENT_LEARNER_GROUP in state:
             self._send_weights()
         if "progress" in state:
-            self._progress = dict(state["progress"])
+            self._progress = {"largest_reward": 0.0, **state["progress"]}
             self._owe_from_now_on()
             for group in (self.env_runner_group, self.eval_env_runner_group):
                 if group is not None and group.num_remote_workers() > 0:  # their episodes are in no checkpoint

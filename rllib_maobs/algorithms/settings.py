@@ -58,6 +58,7 @@ LEGAL: dict[str, Any] = {
     "num_random_steps": NonNegativeInt,
     "num_steps_sampled_before_learning_starts": NonNegativeInt,
     "store_buffer_in_checkpoints": bool,
+    "nonfinite_updates": Literal["raise", "skip"],
     # RLlib's, in the order of `METHODS`.
     "num_cpus_for_main_process": Amount,
     "custom_resources_for_main_process": dict,

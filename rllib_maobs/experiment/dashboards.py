@@ -76,7 +76,8 @@ def curves_of(result: Mapping[str, Any]) -> dict[str, float]:
     """Return what is worth a curve of one result, by group and name.
 
     Groups are `evaluation` (episodes without exploration noise), `train` (those with it), `loss` and `q` (means over
-    the agents, and each agent's), `rate` (learning rates) and `speed`.
+    the agents, and each agent's; `q/max`, the largest |Q| of a minibatch, and `q/limit`, the largest return that there
+    can be by the rewards seen so far), `gradient` (norms), `rate` (learning rates) and `speed`.
 
     Args:
         result: What a trial reported.
@@ -86,18 +87,29 @@ def curves_of(result: Mapping[str, Any]) -> dict[str, float]:
     curves |= {f"train/{name}": value for name, value in runners.get("episode_metrics", {}).items()}
     if "episode_return_mean" in runners:
         curves["train/team_return"] = runners["episode_return_mean"]
+    largest = []
     for agent, learned in result.get("learners", {}).items():
         for name, value in learned.items():
             if agent == "__all_modules__":
                 if name.endswith("_learning_rate"):
                     curves[f"rate/{name.removesuffix('_learning_rate')}"] = value
+                elif name.endswith("_gradient_norm"):
+                    curves[f"gradient/{name.removesuffix('_gradient_norm')}"] = value
+                elif name == "num_updates_skipped_lifetime":
+                    curves["loss/updates_skipped"] = value
             elif name.endswith("_loss"):
                 curves[f"loss/{name.removesuffix('_loss')}/{agent}"] = value
             elif name == "q_mean":
                 curves[f"q/{agent}"] = value
+            elif name == "q_max":
+                largest.append(value)
     for group in ("loss/actor", "loss/critic", "q"):
         each = [value for name, value in curves.items() if name.startswith(f"{group}/")]
         curves |= {f"{group}/mean": sum(each) / len(each)} if each else {}
+    if largest:
+        curves["q/max"] = max(largest)
+    if "q_limit" in (team := result.get("learners", {}).get("__all_modules__", {})):
+        curves["q/limit"] = team["q_limit"]
     curves["speed/seconds_per_iteration"] = result["time_this_iter_s"]
     curves["speed/env_steps_per_s"] = result["env_runners"]["num_env_steps_sampled"] / result["time_this_iter_s"]
     curves["speed/hours"] = result["time_total_s"] / 3600

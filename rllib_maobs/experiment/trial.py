@@ -14,6 +14,7 @@ from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
+from rllib_maobs.learner import Diverged
 
 SHARED_POLICY = "all"
 # What Tune fills in by itself for the trial; the algorithm inside fills in its own, with a config of a thousand lines.
@@ -147,12 +148,24 @@ class Trial(tune.Trainable):
         if self._start_from:
             maobs.load_networks(self._algorithm, self._start_from)
             self._start_from = ""
-        result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
+        try:
+            result = {key: value for key, value in self._algorithm.train().items() if key not in _FILLED_BY_TUNE}
+        except Diverged as error:
+            self._keep(error)
+            raise
         # By this name a search finds it; NaN, which no trial is kept for, if no episode has ended.
         score = evaluation_metrics(result).get(SCORE, math.nan)
         # Tune's own frequency is one for all trials, whose iterations differ in length.
         save = (self.iteration + 1) % self._checkpoint_freq == 0
         return {**result, SCORE: score, SHOULD_CHECKPOINT: save, "done": result[STEPS] >= self._stop_timesteps}
+
+    def _keep(self, error: Diverged) -> None:
+        """Put what a post-mortem needs into the trial's folder, wherever that is."""
+        if self._storage is not None and error.evidence:
+            path = f"{self._storage.trial_fs_path}/{error.file_name}"
+            with self._storage.storage_filesystem.open_output_stream(path) as file:
+                file.write(error.evidence)
+            error.kept_as(path)
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from torch import Tensor
 from torch.func import grad_and_value
 
 from rllib_maobs.learner.compare import compare_networks
+from rllib_maobs.learner.health import MOST_SKIPPED, REPORT, Diverged, evidence_of, not_finite
 from rllib_maobs.learner.networks import ACTOR, CRITIC, MIXER, Parts, TeamNetworks
 from rllib_maobs.learner.update import Recorded, StackedAdam, clipped, compiled
 from rllib_maobs.modules import Params, Stack
@@ -32,7 +34,9 @@ from rllib_maobs.modules.normalizer import Normalizers
 from rllib_maobs.modules.team import Actors, Critics
 from rllib_maobs.replay import Batch, Moment
 
+logger = logging.getLogger(__name__)
 NUM_UPDATES_LIFETIME = "num_updates_lifetime"
+NUM_UPDATES_SKIPPED_LIFETIME = "num_updates_skipped_lifetime"
 _PROGRESS = "progress"
 _CLEANED_EVERY = 100  # updates; a mean falls through all denormal numbers in some 150
 _LAYOUT = 3  # how numbers lie in flat tensors (`Stack`), and so in the optimisers' saved state
@@ -65,6 +69,7 @@ class JointLearner(TorchLearner):
         target_parts: The target networks.
         normalizers: The agents' running normalisation of observations, or None.
         stage: The training stage, see `stage_at`.
+        q_max: The largest |Q| of a minibatch, mean over the updates of the last report.
     """
 
     has_actors = True
@@ -85,8 +90,9 @@ class JointLearner(TorchLearner):
         # With evaluation_parallel_to_training RLlib takes the weights in another thread than it trains in.
         self._updating = threading.Lock()
         self._sum: Tensor | None = None
+        self.q_max = 0.0
         self._updates = self._actor_updates = 0
-        self._updates_lifetime = self._env_steps = 0
+        self._updates_lifetime = self._env_steps = self._skipped_in_a_row = 0
         # What an update may depend on but for numbers in tensors: each combination is compiled (recorded) on its own.
         self.stage = ""
         self._made: dict[tuple[str, bool, int], Callable[..., Any]] = {}
@@ -171,9 +177,7 @@ class JointLearner(TorchLearner):
         by_role, (_, (losses, q, *actor_losses)) = grad_and_value(total, has_aux=True)(
             {role: online[role] for role in trained}
         )
-        report = [losses, q.mean(0), *actor_losses]
-        if self.has_actors and not self._with_actors:
-            report.append(torch.zeros_like(losses))
+        report = [losses, q.mean(0), *(actor_losses or [torch.zeros_like(losses)]), q.abs().amax(0)]
         gradients = {}
         for role, gradient in by_role.items():
             stack = self._roles[role]
@@ -199,16 +203,25 @@ class JointLearner(TorchLearner):
             with_actors: Whether those of the actors, too; None if the algorithm has actors.
 
         Returns:
-            Gradients of "critic", "mixer" and "actor" (those that there are), a vector for each stacked parameter; and,
-            for every agent, the critic's loss, mean Q and the actor's loss, `(3, N)`; `(2, N)` if there are no actors.
+            Gradients of "critic", "mixer" and "actor" (those that there are), a vector for each stacked parameter; and
+            the rows of `REPORT` for every agent, `(6, N)`: zeros of actors that take no part.
         """
         self._with_actors = self.has_actors if with_actors is None else with_actors
         normalizer = {} if self.normalizers is None else self.normalizers.params
         arguments = self._params_of(self._roles), self._params_of(self._targets), normalizer, batch
         key = (self.stage, self._with_actors, len(batch.rewards))
         if key not in self._made:
-            self._made[key] = self._fast(self.joint_gradients)
+            self._made[key] = self._fast(self._measured_gradients)
         return self._made[key](*arguments)
+
+    def _measured_gradients(self, *arguments: Any) -> tuple[dict[str, list[Tensor]], Tensor]:
+        """`joint_gradients` with the norms of the gradients as further rows of the report."""
+        gradients, report = self.joint_gradients(*arguments)
+        norms = []
+        for roles in ((CRITIC, MIXER), (ACTOR,)):
+            parts = [torch.linalg.vector_norm(part) for role in roles for part in gradients.get(role, ())]
+            norms.append(torch.linalg.vector_norm(torch.stack(parts)) if parts else torch.zeros_like(report[0, 0]))
+        return gradients, torch.cat([report, torch.stack(norms)[:, None].expand(-1, report.shape[1])])
 
     def _fast(self, method: Callable[..., Any]) -> Callable[..., Any]:
         """A method as it is to be called again and again: compiled, recorded, or as it is."""
@@ -222,7 +235,7 @@ class JointLearner(TorchLearner):
         return {role: stacks[role].params if role in stacks else {} for role in (ACTOR, CRITIC, MIXER)}
 
     @torch.no_grad()
-    def step(self, batch: Batch) -> Tensor:
+    def step(self, batch: Batch) -> Tensor | None:
         """One update: gradients, Adam, Polyak averaging.
 
         With `policy_delay` the actors and all targets take part in every so many updates only (TD3).
@@ -231,11 +244,18 @@ class JointLearner(TorchLearner):
             batch: The minibatch, as replay gave it.
 
         Returns:
-            The report of `gradients`.
+            The report of `gradients`; None for an update that was skipped.
+
+        Raises:
+            Diverged: If it is not finite and none is to be skipped; the networks are as before.
         """
         with_targets = self._updates_lifetime % self.config.policy_delay == 0
         gradients, report = self.gradients(batch, with_actors=with_targets and self.has_actors)
         self._updates_lifetime += 1
+        if not math.isfinite(report.sum().item()):
+            self._skip(batch, report)
+            return None
+        self._skipped_in_a_row = 0
         self._actor_updates += with_targets
         for role, gradient in gradients.items():
             self._adam.step(role, gradient)
@@ -245,6 +265,36 @@ class JointLearner(TorchLearner):
             for role, stack in self._roles.items():
                 self._targets[role].flat.lerp_(stack.flat, self.config.tau)
         return report
+
+    def _skip(self, batch: Batch, report: Tensor) -> None:
+        """Counts an update that is not made, or raises what is to be said of it."""
+        what = f"{not_finite(report, self.config.module_ids)} in update {self._updates_lifetime}"
+        if self.config.nonfinite_updates == "skip" and self._skipped_in_a_row < MOST_SKIPPED:
+            if not self._skipped_in_a_row:
+                logger.warning(f"{what}: it is skipped.")
+            self._skipped_in_a_row += 1
+            self.metrics.log_value((ALL_MODULES, NUM_UPDATES_SKIPPED_LIFETIME), 1, reduce="lifetime_sum")
+            return
+        after = f", after {MOST_SKIPPED} that were skipped" if self._skipped_in_a_row else ""
+        about = {
+            "what": what,
+            "algorithm": self.config.name,
+            "agents": list(self.config.team.agents),
+            "policies": list(self.config.module_ids),
+            "update": self._updates_lifetime,
+            "gamma": self.config.gamma,
+            "reward_scale": self.config.reward_scale,
+            "learning_rates": {
+                name: group["lr"] for name, o in self._named_optimizers.items() for group in o.param_groups
+            },
+        }
+        weights = ((f"{mid}/{k}", v) for mid, m in self.module.items() for k, v in m.unwrapped().state_dict().items())
+        raise Diverged(
+            f"{what}{after}: training has diverged. Go on from a checkpoint made before, or begin anew, with a lower "
+            f"critic_lr or actor_lr, with grad_clip, or with a smaller reward_scale.",
+            evidence_of(batch, report, weights, about),
+            self._updates_lifetime,
+        )
 
     def prepare(self, batch: Batch, normalizer: Params) -> Batch:
         """A minibatch as the losses see it: observations normalised, rewards scaled, and with its states."""
@@ -393,9 +443,10 @@ class JointLearner(TorchLearner):
         with self._updating, denormals_are_zero():
             for minibatch in whole.unbind():
                 report = self.step(minibatch)
-                self._sum = report.clone() if self._sum is None else self._sum.add_(report)
+                if report is not None:
+                    self._sum = report.clone() if self._sum is None else self._sum.add_(report)
+                    self._updates += 1
         count, size = whole.rewards.shape[:2]
-        self._updates += count
         self._weights_seq_no += 1
         self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED), count * size, reduce="sum")
         self.metrics.log_value((ALL_MODULES, NUM_ENV_STEPS_TRAINED_LIFETIME), count * size, reduce="lifetime_sum")
@@ -410,34 +461,30 @@ class JointLearner(TorchLearner):
         Returns:
             RLlib's reduced metrics, or None if there was no update.
 
-        Raises:
-            FloatingPointError: If a loss or a value was not finite.
         """
         if self._sum is None:
             return None
-        counts = {"critic_loss": self._updates, "q_mean": self._updates, "actor_loss": max(1, self._actor_updates)}
-        for (name, count), values in zip(counts.items(), self._sum.tolist(), strict=False):
+        for name, values in zip(REPORT, self._sum.tolist(), strict=True):
+            of_actors = name.startswith("actor")
+            if of_actors and not self.has_actors:
+                continue
+            count = max(1, self._actor_updates) if of_actors else self._updates
+            if name.endswith("norm"):
+                self.metrics.log_value((ALL_MODULES, name), values[0] / count, window=1)
+                continue
             by_module: dict[str, list[float]] = {}
             for mid, value in zip(self.config.module_ids, values, strict=True):
-                if not math.isfinite(value):
-                    raise FloatingPointError(self._diverged(mid, name, value))
                 by_module.setdefault(mid, []).append(value / count)
             for mid, of_agents in by_module.items():
-                self.metrics.log_value((mid, name), sum(of_agents) / len(of_agents), window=1)
+                value = max(of_agents) if name == "q_max" else sum(of_agents) / len(of_agents)
+                self.metrics.log_value((mid, name), value, window=1)
+            if name == "q_max":
+                self.q_max = max(values) / count
         self.metrics.log_value((ALL_MODULES, NUM_UPDATES_LIFETIME), self._updates, reduce="lifetime_sum")
         self._sum, self._updates, self._actor_updates = None, 0, 0
         self._env_steps = (timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
-
-    def _diverged(self, module_id: str, name: str, value: float) -> str:
-        """What is said when training has come to nothing; the checkpoint before it is still good."""
-        last = self._updates_lifetime
-        return (
-            f"{name} of {module_id} is {value} in one of updates {last - self._updates + 1} to {last}: training has "
-            f"diverged. Go on from a checkpoint made before, or begin anew, with a lower critic_lr or actor_lr, with "
-            f"grad_clip, or with a smaller reward_scale."
-        )
 
     def update_normalizers(self, observations: NDArray[np.float32]) -> None:
         """Takes newly sampled observations `(..., N, O)` into the running normalisation, if there is one."""
@@ -450,8 +497,14 @@ class JointLearner(TorchLearner):
 
     @override(Learner)
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """RLlib's state, the number of updates made and the random numbers to come."""
+        """RLlib's state, the number of updates made and the random numbers to come.
+
+        Raises:
+            Diverged: If weights are not finite: a checkpoint of them would be good for nothing.
+        """
         with self._updating:
+            if bad := [role for role, stack in self._roles.items() if not torch.isfinite(stack.flat).all()]:
+                raise Diverged(f"Weights of {' and '.join(bad)} are not finite: training has diverged.")
             state: dict[str, Any] = super().get_state(*args, **kwargs)
         generator = self._generator.get_state().numpy()
         state[_PROGRESS] = {
