@@ -14,6 +14,7 @@ of it.
 
 import argparse
 import json
+import logging
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -72,6 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--num-agents", nargs="+", type=int, default=[], metavar="N", help="teams of these sizes")
     parser.add_argument("--episodes", type=int, default=100, help="of each (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next one adds 1 (default: 0)")
+    parser.add_argument(
+        "--baselines",
+        nargs="*",
+        choices=BASELINES,
+        default=list(BASELINES),
+        help=f"what to play beside them (default: {' '.join(BASELINES)}); none after it for nothing",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table as CSV")
     parser.add_argument("--per-episode", type=Path, metavar="FILE", help="write a CSV row for each episode")
@@ -94,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path, task in jobs:
         if task not in tasks:  # each task's baselines once, before what is to be held against them
             tasks.append(task)
-            rows += [evaluated(task, name, args.episodes, args.seed) for name in baselines_of(task)]
+            rows += [evaluated(task, name, args.episodes, args.seed) for name in baselines_of(task, args.baselines)]
         rows.append(evaluated(task, path, args.episodes, args.seed).assign(policy=names[path]))
     episodes = pd.concat(rows, ignore_index=True)
     table = summarise_episodes(episodes)
@@ -235,12 +243,12 @@ def evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame
     return pd.concat(rows, ignore_index=True).assign(**labels)
 
 
-def baselines_of(task: Task) -> list[str]:
-    """Return the baselines that a task has; says which one is left out because something is not installed."""
+def baselines_of(task: Task, wanted: Sequence[str] = BASELINES) -> list[str]:
+    """Return those of the wanted baselines that a task has; says which one is left out for want of a package."""
     env = make_vec(task.env, **task.options)
     env.reset(seed=0)
     found = []
-    for name in BASELINES:
+    for name in wanted:
         try:
             make_policy(env, name)(env.observe())
         except NotImplementedError:
@@ -275,4 +283,5 @@ def _write(table: pd.DataFrame, episodes: pd.DataFrame, args: argparse.Namespace
 
 
 if __name__ == "__main__":
+    logging.getLogger("ray").setLevel(logging.ERROR)  # notes of RLlib to its own developers
     main(sys.argv[1:])

@@ -355,4 +355,5 @@ def _is_plain(value: Any) -> bool:
 
 
 if __name__ == "__main__":
+    logging.getLogger("ray").setLevel(logging.ERROR)  # notes of RLlib to its own developers
     main(sys.argv[1:])

@@ -16,6 +16,7 @@ policy play teams of any size:
 
 import argparse
 import ast
+import logging
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -132,4 +133,5 @@ def _film(env: MAObsParallelEnv, recorder: Recorder | None) -> None:
 
 
 if __name__ == "__main__":
+    logging.getLogger("ray").setLevel(logging.ERROR)  # notes of RLlib to its own developers
     main(sys.argv[1:])

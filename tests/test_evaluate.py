@@ -86,10 +86,22 @@ def test_a_trial_is_evaluated_as_its_training_was(trial_folder: Path, tmp_path: 
 
 
 def test_teams_of_other_sizes(trial_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(trial_folder, "--episodes", 2, "--num-agents", 2, 9, "--csv", tmp_path / "sizes.csv", "horizon=2")
+    run(
+        trial_folder,
+        "--episodes",
+        2,
+        "--num-agents",
+        2,
+        9,
+        "--csv",
+        tmp_path / "sizes.csv",
+        "--baselines",
+        "heuristic",
+        "horizon=2",
+    )
     table = pd.read_csv(tmp_path / "sizes.csv")
-    assert list(table["agents"]) == [2] * 4 + [9] * 4
-    nine = json.loads(table["options"][7])
+    assert list(table["agents"]) == [2] * 2 + [9] * 2 and list(table["policy"][:2]) == ["heuristic", "maddpg-seed0"]
+    nine = json.loads(table["options"][3])
     assert nine == asdict(make_scenario("spread-9a", action_mode="force", horizon=2).options)
     out = capsys.readouterr().out
     assert "spread-3a, 9 agents" in out

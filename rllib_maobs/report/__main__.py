@@ -9,6 +9,7 @@ heuristic and ORCA. It is one HTML file that needs no network.
 """
 
 import argparse
+import logging
 import os
 import platform
 import sys
@@ -156,4 +157,5 @@ def machine() -> str:
 
 
 if __name__ == "__main__":
+    logging.getLogger("ray").setLevel(logging.ERROR)  # notes of RLlib to its own developers
     main(sys.argv[1:])
