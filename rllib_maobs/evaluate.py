@@ -75,10 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next one adds 1 (default: 0)")
     parser.add_argument(
         "--baselines",
-        nargs="*",
-        choices=BASELINES,
-        default=list(BASELINES),
-        help=f"what to play beside them (default: {' '.join(BASELINES)}); none after it for nothing",
+        type=_baselines,
+        default=BASELINES,
+        metavar="NAME,NAME",
+        help=f"what to play beside them, or none (default: {','.join(BASELINES)})",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table as CSV")
@@ -116,6 +116,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         play(env, make_policy(env.vector, best, args.seed), seed=args.seed, recorder=recorder)
         recorder.close()
         print(f"written: {args.record}")
+
+
+def _baselines(text: str) -> list[str]:
+    names = [] if text == "none" else text.split(",")
+    if wrong := [name for name in names if name not in BASELINES]:
+        raise argparse.ArgumentTypeError(f"{wrong[0]!r} is illegal; legal: none, or some of {','.join(BASELINES)}")
+    return names
 
 
 def check_arguments(

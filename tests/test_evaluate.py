@@ -124,6 +124,7 @@ def test_resized_tasks() -> None:
     ("arguments", "message"),
     [
         (["--episodes", 1], "--episodes 1 is illegal; legal: an integer >= 2"),
+        (["--baselines", "orka"], "'orka' is illegal; legal: none, or some of random,heuristic,orca"),
         (["--num-agents", 0], "--num-agents 0 is illegal; legal: integers >= 1"),
         (["agent_range=0.2", "--num-agents", 12], "use fewer or smaller bodies"),
         (["num_agents=4", "--num-agents", 3], "--num-agents and num_agents=... say the same"),
