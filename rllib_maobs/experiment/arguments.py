@@ -165,6 +165,14 @@ def make_parser(
         help="Ray cluster to run on (auto: the one that this machine is in) instead of starting one here; all its "
         "machines must have this package, and see --results-dir under the same path",
     )
+    how.add_argument(
+        "--max-failures",
+        type=natural,
+        default=2,
+        metavar="N",
+        help="how often a trial may fail, say because its process or machine dies, and go on from its last checkpoint; "
+        "errors that would come again (wrong input, training that diverges) end it at once",
+    )
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
     how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard (pip install ray[default])")
 

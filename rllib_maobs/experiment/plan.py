@@ -63,6 +63,7 @@ def print_plan(name: str, args: Namespace, specs: Sequence[TrialSpec], note: str
         f"\n{format_table(header, cells)}\n\n{estimate}\n"
         f"Results: {args.results_dir}\n"
         f"TensorBoard: tensorboard --logdir {shlex.quote(str(args.results_dir))}\n"
+        f"A trial that fails goes on from its last checkpoint, {args.max_failures} times at most (--max-failures).\n"
         f"Ctrl-C stops; then --resume goes on from the last checkpoints.\n",
         flush=True,
     )

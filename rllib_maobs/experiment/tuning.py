@@ -20,6 +20,7 @@ from rllib_maobs.experiment.resume import (
     known_trials,
     lengthen,
 )
+from rllib_maobs.experiment.retries import Retries
 from rllib_maobs.experiment.search import Search, stopping
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
@@ -42,7 +43,7 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
         storage_path=str(args.results_dir.parent),
         checkpoint_config=_checkpoints(),
         progress_reporter=_progress(args),
-        callbacks=make_callbacks(name, args),
+        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
         verbose=1,
     )
     tune_config = tune.TuneConfig(
@@ -99,7 +100,7 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         search_alg=way,
         scheduler=_scheduler(search, specs),
         progress_reporter=_progress(args),
-        callbacks=make_callbacks(name, args),
+        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
         raise_on_failed_trial=False,
         verbose=1,
     )
