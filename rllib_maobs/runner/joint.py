@@ -511,6 +511,16 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._seed_anew(after)
         self._obs, self._needs_reset = None, True
 
+    def take_over(self, env_steps: int) -> None:
+        """Starts in the place of a process that has died: schedules go on, episodes and noise are not its first ones.
+
+        Args:
+            env_steps: That the run has sampled so far.
+        """
+        self.num_env_steps_sampled_lifetime = env_steps
+        self._seed_anew(env_steps)
+        self._obs, self._needs_reset = None, True
+
     @override(Checkpointable)
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """What builds this runner again."""
