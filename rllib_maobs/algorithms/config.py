@@ -121,6 +121,7 @@ class JointConfig(AlgorithmConfig):
         self.num_random_steps = 0
         self.num_steps_sampled_before_learning_starts = 0
         self.store_buffer_in_checkpoints = True
+        self.env_timeout_s: float | None = None
         # RLlib's, set to what joint sampling wants.
         self.env_runner_cls = JointEnvRunner
         self.num_env_runners = 0
@@ -160,6 +161,7 @@ class JointConfig(AlgorithmConfig):
         num_random_steps: int = NotProvided,
         num_steps_sampled_before_learning_starts: int = NotProvided,
         store_buffer_in_checkpoints: bool = NotProvided,
+        env_timeout_s: float | None = NotProvided,
         **kwargs: Any,
     ) -> Self:
         """Sets the training settings.
@@ -217,6 +219,9 @@ class JointConfig(AlgorithmConfig):
                 sampled in any case. These steps owe no updates. Default 0.
             store_buffer_in_checkpoints: Whether checkpoints hold the replay buffer, so that a restored run goes
                 on exactly as it would have. Default True.
+            env_timeout_s: Seconds that one step or reset of one copy of an environment of your own may take. Then it is
+                interrupted by a TimeoutError that names copy and step, which counts as an error of the environment
+                (docs/callbacks.md). Default None: no limit.
             **kwargs: RLlib's own: `gamma` (0.95), `train_batch_size_per_learner` (256), `grad_clip` (None) with
                 `grad_clip_by` ("global_norm": each network's whole gradient on its own; "norm": each of its
                 tensors; "value": each number), ...
