@@ -207,6 +207,7 @@ class JointReplayBuffer(Checkpointable):
         final_recurrent_state: NDArray[np.float32] | None = None,
         source: str = "",
         start: int = 0,
+        failed: NDArray[np.bool_] | None = None,
     ) -> None:
         """Appends L steps of E copies that stepped together.
 
@@ -226,6 +227,8 @@ class JointReplayBuffer(Checkpointable):
             source: Who sampled the steps. Steps of one source that follow one another are linked.
             start: Number of the first step among the source's. A gap to what was added before (a lost or
                 restarted runner) breaks the link instead of joining two episodes.
+            failed: Where the environment failed instead of stepping, `(L, E)`: the episode breaks off with that step's
+                observation, and another one follows. None if it nowhere did.
         """
         length, copies = truncated.shape
         if terminated.shape != (length, copies, self._arguments["num_agents"]):
@@ -247,7 +250,13 @@ class JointReplayBuffer(Checkpointable):
         following[:-1] = row[1:]
         following[done] = last
         previous = np.full((length, copies), _NONE, dtype=np.int64)
-        previous[1:] = np.where(done[:-1], _NONE, row[:-1])
+        over = done
+        if failed is not None:
+            if failed.shape != done.shape or (failed & done).any():
+                raise ValueError(f"'failed' must be an array {done.shape}, and true where no episode ended.")
+            following[failed] = _NONE
+            over = done | failed
+        previous[1:] = np.where(over[:-1], _NONE, row[:-1])
         last_kept = self._head + steps + last.size - self.capacity
         for copy in range(copies):
             tail, position = self._tails.get((source, copy), (_NONE, 0))
@@ -255,7 +264,7 @@ class JointReplayBuffer(Checkpointable):
             if alive and position == start:
                 self._next[tail % self.capacity] = row[0, copy]
                 previous[0, copy] = tail
-            self._tails[source, copy] = (_NONE if done[-1, copy] else row[-1, copy], start + length)
+            self._tails[source, copy] = (_NONE if over[-1, copy] else row[-1, copy], start + length)
         self._next[row % self.capacity] = following
         self._next[last % self.capacity] = _NONE
         self._previous[row % self.capacity] = previous

@@ -359,6 +359,7 @@ def used(tmp_path: Path) -> Path:
         ("--stop-timesteps 0", "argument --stop-timesteps: '0' is not a whole number >= 1"),
         ("--stop-timesteps inf", "argument --stop-timesteps: 'inf' is not a whole number >= 1"),
         ("--workers -1", "argument --workers: '-1' is not a whole number >= 1"),
+        ("--max-failures -1", "argument --max-failures: '-1' is not a whole number >= 0"),
         ("--train-horizon 2.5", "argument --train-horizon: '2.5' is not a whole number >= 1"),
         ("--num-env-runners nan", "argument --num-env-runners: 'nan' is not a whole number >= 0"),
         ("--address auto --workers 3", "--workers is for this machine; with --address the free cores of the cluster"),
@@ -903,7 +904,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     command = [sys.executable, str(script), "--results-dir", f"./{results.name}/"]
     # Tune copies results to the folder with each checkpoint; with one an iteration the first trial is killed early, and
     # has checkpoints to write after it is resumed: there a decision that is not forgotten would stop it.
-    first = [*command, "--quick", "--checkpoint-freq", "1"]
+    first = [*command, "--quick", "--checkpoint-freq", "1", "--max-failures", "0"]
     with subprocess.Popen(first, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             killed = wait_for(lambda: read_results(results / TRIALS[0])[1:], process)

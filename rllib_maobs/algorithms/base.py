@@ -244,8 +244,10 @@ class JointAlgorithm(AnyPath, Algorithm):
         results = self.env_runner_group.foreach_env_runner(
             lambda runner: runner.get_metrics(),
             local_env_runner=self.env_runner_group.num_remote_workers() == 0,
+            timeout_seconds=self.config.sample_timeout_s,  # one that hangs says nothing, either
         )
         self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        self._count_as_stored()
         timesteps = {NUM_ENV_STEPS_SAMPLED_LIFETIME: self._progress["env_steps"]}
         report = self._learner.report(timesteps=timesteps)
         if report is not None:
@@ -266,6 +268,30 @@ class JointAlgorithm(AnyPath, Algorithm):
                 f"steps, and no return can be larger than {limit:.3g} (the largest reward so far, {largest:.3g}, at "
                 f"every step). A lower critic_lr or tau, grad_clip or a smaller reward_scale may help."
             )
+
+    def _count_as_stored(self) -> None:
+        """Reports the env steps that came to be trained on.
+
+        A runner that dies takes its counts with it, of steps that it gave before; and one that was too late has counted
+        what was not waited for.
+        """
+        key = (ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME)
+        if lost := self._progress["env_steps"] - int(self.metrics.peek(key, default=0)):
+            self.metrics.log_value(key, lost, reduce="lifetime_sum")
+
+    @override(Algorithm)
+    def restore_env_runners(self, env_runner_group: Any) -> list[int]:
+        """RLlib's; runners that come back do not repeat the episodes and the noise that they began with."""
+        restored: list[int] = super().restore_env_runners(env_runner_group)
+        if restored:
+            steps = self._progress["env_steps"]
+            env_runner_group.foreach_env_runner(
+                lambda runner: runner.take_over(steps),
+                remote_worker_ids=restored,
+                local_env_runner=False,
+                timeout_seconds=self.config.env_runner_restore_timeout_s,
+            )
+        return restored
 
     def _follow(self, saved: Team | None) -> None:
         """Builds everything anew if a saved team, whose state is to be taken over, stands in another order.

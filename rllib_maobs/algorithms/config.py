@@ -122,6 +122,7 @@ class JointConfig(AlgorithmConfig):
         self.num_steps_sampled_before_learning_starts = 0
         self.store_buffer_in_checkpoints = True
         self.nonfinite_updates: Literal["raise", "skip"] = "raise"
+        self.env_timeout_s: float | None = None
         # RLlib's, set to what joint sampling wants.
         self.env_runner_cls = JointEnvRunner
         self.num_env_runners = 0
@@ -162,6 +163,7 @@ class JointConfig(AlgorithmConfig):
         num_steps_sampled_before_learning_starts: int = NotProvided,
         store_buffer_in_checkpoints: bool = NotProvided,
         nonfinite_updates: Literal["raise", "skip"] = NotProvided,
+        env_timeout_s: float | None = NotProvided,
         **kwargs: Any,
     ) -> Self:
         """Sets the training settings.
@@ -222,6 +224,9 @@ class JointConfig(AlgorithmConfig):
             nonfinite_updates: What becomes of an update whose losses, values or gradients are not finite: "raise"
                 (default) ends training with what is needed for a post-mortem; "skip" leaves it out and counts it
                 (`num_updates_skipped_lifetime`), until 100 come one after the other.
+            env_timeout_s: Seconds that one step or reset of one copy of an environment of your own may take. Then it is
+                interrupted by a TimeoutError that names copy and step, which counts as an error of the environment
+                (docs/callbacks.md). Default None: no limit.
             **kwargs: RLlib's own: `gamma` (0.95), `train_batch_size_per_learner` (256), `grad_clip` (None) with
                 `grad_clip_by` ("global_norm": each network's whole gradient on its own; "norm": each of its
                 tensors; "value": each number), ...

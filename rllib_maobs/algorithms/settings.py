@@ -59,6 +59,7 @@ LEGAL: dict[str, Any] = {
     "num_steps_sampled_before_learning_starts": NonNegativeInt,
     "store_buffer_in_checkpoints": bool,
     "nonfinite_updates": Literal["raise", "skip"],
+    "env_timeout_s": Positive | None,
     # RLlib's, in the order of `METHODS`.
     "num_cpus_for_main_process": Amount,
     "custom_resources_for_main_process": dict,
@@ -187,7 +188,7 @@ HONOURED: dict[str, str] = {
     ),
     **_each(
         "restart_failed_sub_environments",
-        "all copies of the runner together, as often as failures are tolerated (callbacks.md)",
+        "of environments of your own the copy that fails; as often as failures are tolerated (callbacks.md)",
     ),
     **_each("ignore_env_runner_failures max_num_env_runner_restarts delay_between_env_runner_restarts_s"),
     **_each("num_consecutive_env_runner_failures_tolerance"),

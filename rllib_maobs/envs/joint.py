@@ -23,6 +23,7 @@ from ray.tune.registry import register_env
 from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
 from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
+from rllib_maobs.envs.time_limit import time_limit
 
 
 def register_envs() -> list[str]:
@@ -91,6 +92,11 @@ def make_joint_env(creator: Callable[[Any], Any], context: Mapping[str, Any], nu
 _stepped: WeakValueDictionary[int, StackedEnv] = WeakValueDictionary()
 
 
+def make_copy(creator: Callable[[Any], Any], context: Mapping[str, Any], copy: int) -> Any:
+    """One copy of what an environment creator makes, as `make_joint_env` makes them."""
+    return creator(_own_context(context, copy))
+
+
 def _own_context(context: Mapping[str, Any], copy: int) -> Any:
     """What one copy is made from: whatever its constructor does to it, the others do not see."""
     own: Any = deepcopy(context)
@@ -123,6 +129,8 @@ class StackedEnv:
     Attributes:
         observation_layouts: What each agent's observation is made of, None if the environment does not say.
         state_layout: What its `state()` is made of, None if it does not say.
+        timeout_s: Seconds that one step or reset of one copy may take; None for no limit.
+        isolates: Whether an error in one copy's step is no error of the others': they step, and it is in the info.
 
     Args:
         envs: The copies: RLlib `MultiAgentEnv`s or PettingZoo `ParallelEnv`s.
@@ -130,6 +138,9 @@ class StackedEnv:
     Raises:
         ValueError: If the environment does not list its `possible_agents`, is not parallel, or has no seeded reset.
     """
+
+    timeout_s: float | None = None
+    isolates: bool = False
 
     def __init__(self, envs: Sequence[Any]) -> None:
         env = envs[0]
@@ -155,12 +166,6 @@ class StackedEnv:
             signature(env.reset).bind(seed=0)
         except TypeError as error:
             raise ValueError(f"{self._name}.reset() takes no seed ({error}); legal: reset(seed=None).") from None
-        for copy, other in enumerate(envs):
-            if set(theirs := list(other.possible_agents)) != set(self.agents):
-                raise ValueError(
-                    f"The agents of {self._name} are {self.agents} in copy 0, but {theirs} in copy {copy}: legal is "
-                    f"the same set of agents in all copies."
-                )
         self._envs = list(envs)
         self._infos: list[Mapping[str, Any]] = [{}] * self.num_envs
         self._flagged = {*self.agents, "__all__"}
@@ -171,15 +176,40 @@ class StackedEnv:
         # RLlib calls them get_observation_space(agent), PettingZoo observation_space(agent).
         self.observation_spaces, self.action_spaces = self._spaces(env)
         for copy, other in enumerate(envs):
-            if (spaces := self._spaces(other)) != (self.observation_spaces, self.action_spaces):
-                raise ValueError(
-                    f"The spaces of {self._name} are {self.observation_spaces}, {self.action_spaces} in copy 0, but "
-                    f"{spaces[0]}, {spaces[1]} in copy {copy}: legal are the same ones in all copies."
-                )
+            self._check_alike(copy, other)
         self._sizes = {a: int(np.prod(space.shape or ())) for a, space in self.observation_spaces.items()}
         self._size = max(self._sizes.values())
         self.observation_layouts: Mapping[str, Groups | None] | None = getattr(env, "observation_layouts", None)
         self.state_layout: Groups | None = getattr(env, "state_layout", None)
+
+    def _check_alike(self, copy: int, env: Any) -> None:
+        """Raises a ValueError if a copy has other agents or spaces than the first one."""
+        if set(theirs := list(env.possible_agents)) != set(self.agents):
+            raise ValueError(
+                f"The agents of {self._name} are {self.agents} in copy 0, but {theirs} in copy {copy}: legal is "
+                f"the same set of agents in all copies."
+            )
+        if (spaces := self._spaces(env)) != (self.observation_spaces, self.action_spaces):
+            raise ValueError(
+                f"The spaces of {self._name} are {self.observation_spaces}, {self.action_spaces} in copy 0, but "
+                f"{spaces[0]}, {spaces[1]} in copy {copy}: legal are the same ones in all copies."
+            )
+
+    def replace(self, copy: int, env: Any) -> None:
+        """Takes another environment in the place of a copy; it is to be reset before it is stepped.
+
+        Raises:
+            ValueError: If it is stepped already, or differs from the other copies.
+        """
+        if id(_innermost(env)) in _stepped:
+            raise ValueError(
+                f"The new copy {copy} of {self._name} and one that is stepped are one object: the environment's "
+                f"creator must return a new one each time."
+            )
+        self._check_alike(copy, env)
+        _stepped.pop(id(_innermost(self._envs[copy])), None)
+        _stepped[id(_innermost(env))] = self
+        self._envs[copy] = env
 
     def _spaces(self, env: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         """Each agent's spaces of observations and of actions."""
@@ -212,7 +242,7 @@ class StackedEnv:
             if mask is not None and not mask[copy]:
                 continue
             self._steps[copy] = 0
-            result = self._envs[copy].reset(seed=None if seed is None else seed[copy])
+            result = self._call(copy, "reset", seed=None if seed is None else seed[copy])
             if not _are(result, (Mapping, Mapping | None)):
                 raise self._error(copy, f"reset() returns {_kinds(result)}", "two dicts by agent: observations, infos")
             self._infos[copy] = self._infos_of(result[1], copy)
@@ -233,7 +263,8 @@ class StackedEnv:
         """Steps every copy by its agents' actions `(E, N, A)`, or by their numbers `(E, N)`.
 
         Returns:
-            As `JointEnv.step`, terminated `(E, N)`.
+            As `JointEnv.step`, terminated `(E, N)`. If `isolates`, the info has under "failed" the errors of copies:
+            their rewards are 0, and they are to be replaced and reset.
 
         Raises:
             ValueError: If what it returns is not legal, or some agents end before the others; names copy, step and
@@ -244,33 +275,61 @@ class StackedEnv:
         terminated = np.zeros(actions.shape[:2], dtype=np.bool_)
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         metrics: dict[str, Float] = {}
-        for copy, env in enumerate(self._envs):
-            joint = {
-                agent: self._action(self.action_spaces[agent], action)
-                for agent, action in zip(self.agents, actions[copy], strict=True)
-            }
-            result = env.step(joint)
-            self._steps[copy] += 1
-            if not _are(result, (*[Mapping] * 4, Mapping | None)):
-                legal = "five dicts by agent: observations, rewards, terminated, truncated, infos"
-                raise self._error(copy, f"step() returns {_kinds(result)}", legal)
-            obs, reward, terminations, truncations, infos = result
-            self._infos[copy] = infos = self._infos_of(infos, copy)
-            self._obs[copy] = self._stack(obs, copy)
-            rewards[copy] = self._rewards(reward, copy)
-            over = self._flags(terminations, truncations, copy)
-            if over is not None:
-                terminated[copy] = over
-                truncated[copy] = not over.all()
-                for name, value in self._metrics_of(infos, copy).items():
-                    metrics.setdefault(name, np.full(self.num_envs, np.nan, dtype=np.float32))[copy] = value
+        failed: dict[int, Exception] = {}
+        for copy in range(self.num_envs):
+            try:
+                rewards[copy], over = self._step_copy(copy, actions[copy])
+                if over is not None:
+                    terminated[copy] = over
+                    truncated[copy] = not over.all()
+                    for name, value in self._metrics_of(self._infos[copy], copy).items():
+                        metrics.setdefault(name, np.full(self.num_envs, np.nan, dtype=np.float32))[copy] = value
+            except Exception as error:
+                if not self.isolates:
+                    raise
+                failed[copy] = error
+                rewards[copy], terminated[copy], truncated[copy] = 0.0, False, False
         return (
             self._obs.copy(),
             rewards,
             terminated,
             truncated,
-            {"infos": list(self._infos), **({"episode_metrics": metrics} if metrics else {})},
+            {
+                "infos": list(self._infos),
+                **({"episode_metrics": metrics} if metrics else {}),
+                **({"failed": failed} if failed else {}),
+            },
         )
+
+    def _step_copy(self, copy: int, actions: Float) -> tuple[list[float], Bool | None]:
+        """Steps one copy by its agents' actions; returns their rewards, and who terminated if its episode is over."""
+        assert self._obs is not None
+        env = self._envs[copy]
+        joint = {
+            agent: self._action(self.action_spaces[agent], action)
+            for agent, action in zip(self.agents, actions, strict=True)
+        }
+        result = env.step(joint) if self.timeout_s is None else self._call(copy, "step", joint)
+        self._steps[copy] += 1
+        if not _are(result, (*[Mapping] * 4, Mapping | None)):
+            legal = "five dicts by agent: observations, rewards, terminated, truncated, infos"
+            raise self._error(copy, f"step() returns {_kinds(result)}", legal)
+        obs, reward, terminations, truncations, infos = result
+        self._infos[copy] = self._infos_of(infos, copy)
+        self._obs[copy] = self._stack(obs, copy)
+        return self._rewards(reward, copy), self._flags(terminations, truncations, copy)
+
+    def _call(self, copy: int, method: str, *args: Any, **how: Any) -> Any:
+        """What a copy's method returns, if it does in time."""
+        call = getattr(self._envs[copy], method)
+        if self.timeout_s is None:
+            return call(*args, **how)
+        where = f"environment copy {copy} at step {self._steps[copy]} of its episode"
+        with time_limit(
+            self.timeout_s,
+            lambda: f"{self._name}: {method}() takes longer than env_timeout_s={self.timeout_s:g} s in {where}.",
+        ):
+            return call(*args, **how)
 
     def _error(self, copy: int, what: str, legal: str) -> ValueError:
         where = f"environment copy {copy} at step {self._steps[copy]} of its episode"

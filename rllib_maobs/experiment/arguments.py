@@ -10,6 +10,7 @@ from typing import Any
 from rllib_maobs.experiment.claim import LOCK
 from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
+from rllib_maobs.experiment.storage import Storage, is_url
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
 
 _FILE = "experiment.json"
@@ -65,7 +66,13 @@ def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
 def _absolute(path: str) -> str:
     if not path:  # it would be the present folder
         raise argparse.ArgumentTypeError("an empty path; give the folder of a checkpoint, or of a trial")
+    if is_url(path):
+        raise argparse.ArgumentTypeError(f"{path} is a URL; copy the checkpoint to a folder that all machines see")
     return str(Path(path).expanduser().resolve())
+
+
+def _place(text: str) -> Path | str:
+    return text if is_url(text) else Path(text)  # a Path would make one slash of two
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -97,7 +104,8 @@ def make_parser(
     )
     positive, natural, seed = _whole_number(1), _whole_number(0), _whole_number(0, 2**32 - 1)
     parser = argparse.ArgumentParser(description=doc, formatter_class=_Help, allow_abbrev=False)
-    parser.set_defaults(lengthened_to=None)  # env steps of a finished run that goes on, see `parse`
+    # Env steps of a finished run that goes on, and results at a URL: see `parse`.
+    parser.set_defaults(lengthened_to=None, storage=None)
     what = parser.add_argument_group("what to train")
     what.add_argument("--algos", nargs="+", choices=algos, default=list(algos), help="algorithms to compare")
     what.add_argument(
@@ -163,7 +171,15 @@ def make_parser(
     how.add_argument(
         "--address",
         help="Ray cluster to run on (auto: the one that this machine is in) instead of starting one here; all its "
-        "machines must have this package, and see --results-dir under the same path",
+        "machines must have this package, and reach --results-dir: a folder that they share, or a URL",
+    )
+    how.add_argument(
+        "--max-failures",
+        type=natural,
+        default=2,
+        metavar="N",
+        help="how often a trial may fail, say because its process or machine dies, and go on from its last checkpoint; "
+        "errors that would come again (wrong input, training that diverges) end it at once",
     )
     how.add_argument("--no-compile", action="store_true", help="update without torch.compile: slower, starts at once")
     how.add_argument("--dashboard", action="store_true", help="start Ray's dashboard (pip install ray[default])")
@@ -177,8 +193,10 @@ def make_parser(
     where = parser.add_argument_group("where results go")
     where.add_argument(
         "--results-dir",
-        type=Path,
-        help=f"folder for everything that is written (default: results/{name}, with --quick results/{name}-quick)",
+        type=_place,
+        metavar="FOLDER_OR_URL",
+        help=f"folder for everything that is written, or its URL (s3://..., docs/experiments.md; default: "
+        f"results/{name}, with --quick results/{name}-quick)",
     )
     where.add_argument(
         "--checkpoint-freq",
@@ -213,7 +231,8 @@ def parse(
         quick_algos: Algorithms of a quick run; none for all.
 
     Returns:
-        The arguments, with an absolute `results_dir`; those of the original run with `--resume`.
+        The arguments, with an absolute `results_dir`; those of the original run with `--resume`. Of results at a URL
+        `results_dir` is the folder of `storage`.
     """
     args = parser.parse_args(argv)
     if args.search:
@@ -231,23 +250,30 @@ def parse(
     if args.address and args.workers != parser.get_default("workers"):
         parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
 
-    results_dir = args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)
-    results_dir = results_dir.expanduser().resolve()
+    place = args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)
+    storage = None
+    if isinstance(place, str):
+        try:
+            storage = Storage(place)
+            storage.pull()
+        except ValueError as error:
+            parser.error(str(error))
+        results_dir = storage.folder
+    else:
+        place = results_dir = place.expanduser().resolve()
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
     args.resume = args.resume or bool(args.add_seeds or args.add_algos)
     if args.resume:
         if not has_started(results_dir) or not (results_dir / _FILE).is_file():
-            parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
+            parser.error(f"there is nothing to resume in {place}: leave --resume out, or correct --results-dir")
         stored = json.loads((results_dir / _FILE).read_text())
         if (other := stored.pop("experiment")) != name:
-            parser.error(f"{results_dir} holds a run of {other}, not of {name}: correct --results-dir")
+            parser.error(f"{place} holds a run of {other}, not of {name}: correct --results-dir")
         args = _with_stored_settings(parser, argv, {"lengthened_to": None, **stored})
     elif has_started(results_dir):
-        parser.error(
-            f"{results_dir} is not empty: continue the run there with --resume, or choose another --results-dir"
-        )
-    args.results_dir = results_dir
+        parser.error(f"{place} is not empty: continue the run there with --resume, or choose another --results-dir")
+    args.results_dir, args.storage = results_dir, storage
     return args
 
 

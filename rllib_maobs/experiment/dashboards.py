@@ -39,6 +39,10 @@ def check_dashboards(args: Namespace, env: str) -> None:
     for flag, (package, install) in _NEEDS.items():
         if getattr(args, flag) and find_spec(package) is None:
             raise ValueError(f"--{flag} needs {package}: {install}")
+    if args.storage and args.mlflow and "MLFLOW_TRACKING_URI" not in os.environ:
+        raise ValueError("--mlflow with results at a URL needs a server of MLflow: set MLFLOW_TRACKING_URI")
+    if args.storage and args.wandb and os.environ.get("WANDB_MODE") == "offline":
+        raise ValueError("--wandb with WANDB_MODE=offline needs a folder as --results-dir")
     if args.video and env.removeprefix("maobs/") not in SCENARIOS:
         raise ValueError(f"--video: {env} is not an environment of this package, so there are no pictures of it")
 
@@ -171,7 +175,8 @@ class TensorBoard(TBXLoggerCallback):
         steps = int(trial.last_result[STEPS])
         path = Path(trial.local_path) / f"episode-{steps}.gif"
         try:
-            film(TrialSpec(**trial.config), trial.checkpoint.path, path)
+            with trial.checkpoint.as_directory() as folder:  # it may be at a URL
+                film(TrialSpec(**trial.config), folder, path)
         except Exception as error:
             print(f"No film of {trial} at {steps:,} env steps: {str(error).partition(chr(10))[0]}", flush=True)
             return

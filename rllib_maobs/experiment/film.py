@@ -1,6 +1,6 @@
 """The film at the end of a run: an episode of the best that was trained."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from rllib_maobs.envs import SCENARIOS, Recorder, parallel_env
@@ -10,7 +10,13 @@ from rllib_maobs.play import play
 from rllib_maobs.policies import make_policy
 
 
-def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[str] = (), last: int = LAST) -> str:
+def film_best(
+    results_dir: Path,
+    specs: Sequence[TrialSpec],
+    failed: Collection[str] = (),
+    last: int = LAST,
+    fetch: Callable[[str], None] | None = None,
+) -> str:
     """Film an episode of the best trial, as its last checkpoint plays it, and show it in comparison.md.
 
     Args:
@@ -18,6 +24,7 @@ def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[
         specs: Its trials.
         failed: Names of trials that do not count.
         last: How many evaluations at the end of each trial count.
+        fetch: Brings a trial's checkpoints into the folder, by its name, if they are not there.
 
     Returns:
         A line that says where the film is, or why there is none; a film that fails is no reason to fail.
@@ -30,6 +37,8 @@ def film_best(results_dir: Path, specs: Sequence[TrialSpec], failed: Collection[
         return "No film: nothing has been evaluated."
     if spec.env.removeprefix("maobs/") not in SCENARIOS:
         return f"No film: {spec.env} is not an environment of this package."
+    if fetch:
+        fetch(spec.name)
     checkpoint = max((results_dir / spec.name).glob("checkpoint_*"), default=None)
     if checkpoint is None:
         return f"No film: {spec.name}, the best one, has no checkpoint."

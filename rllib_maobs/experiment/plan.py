@@ -12,6 +12,7 @@ import ray
 
 from rllib_maobs.experiment.progress import makespan
 from rllib_maobs.experiment.report import load_curves
+from rllib_maobs.experiment.storage import shown
 from rllib_maobs.experiment.tables import format_table, format_time
 from rllib_maobs.experiment.trial import Pace, TrialSpec, measure_pace
 
@@ -61,8 +62,9 @@ def print_plan(name: str, args: Namespace, specs: Sequence[TrialSpec], note: str
             row += [f"{speed:.0f}", format_time(spec.stop_timesteps / speed)]
     print(
         f"\n{format_table(header, cells)}\n\n{estimate}\n"
-        f"Results: {args.results_dir}\n"
-        f"TensorBoard: tensorboard --logdir {shlex.quote(str(args.results_dir))}\n"
+        f"Results: {shown(args)}\n"
+        f"TensorBoard: tensorboard --logdir {shlex.quote(shown(args))}\n"
+        f"A trial that fails goes on from its last checkpoint, {args.max_failures} times at most (--max-failures).\n"
         f"Ctrl-C stops; then --resume goes on from the last checkpoints.\n",
         flush=True,
     )
@@ -116,12 +118,13 @@ def _measured(args: Namespace, specs: Sequence[TrialSpec], count: int) -> tuple[
         / 1e6
         for spec in rows
     )
+    free = "" if args.storage else f"; free disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB"
     return pace, (
         f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
         f"compiling.\n"
         f"Estimated: {'at most ' if args.search else ''}{total / 3600:.2f} hours for all, {at_once} at once.\n"
-        f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and as much of disk in its checkpoint; "
-        f"free disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB."
+        f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and as much of disk in its "
+        f"checkpoint{free}."
     )
 
 

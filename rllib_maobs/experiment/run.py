@@ -3,6 +3,7 @@
 import logging
 import os
 import shlex
+import socket
 import sys
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
@@ -28,6 +29,7 @@ from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_
 from rllib_maobs.experiment.resume import StateError
 from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row, takes
 from rllib_maobs.experiment.search import Search, Space, check_installed
+from rllib_maobs.experiment.storage import shown
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED, Values, check_names, name_of, parse_sweep, points, vary
 from rllib_maobs.experiment.trial import TrialSpec
 from rllib_maobs.experiment.tuning import resume, start
@@ -169,6 +171,8 @@ class Experiment:
         except StateError as error:
             sys.exit(f"error: {error}")
         except KeyboardInterrupt:  # While trials run, Tune takes the first one: it saves its state and returns.
+            if args.storage:
+                args.storage.pull()
             print("\nInterrupted.", f"Go on with: {_resume_command(args)}" if has_started(args.results_dir) else "")
             code = 130
         if code:
@@ -290,10 +294,11 @@ class Experiment:
         """Measure, train, report; return the exit code."""
         started = _start_ray(args)
         try:
+            _check_cpus(args)
             maobs.register()
             args.results_dir.mkdir(parents=True, exist_ok=True)
             if args.resume:
-                print(f"Resuming {self.name} in {args.results_dir}", flush=True)
+                print(f"Resuming {self.name} in {shown(args)}", flush=True)
                 if args.lengthened_to:
                     self._print_kept(args)
             else:
@@ -340,17 +345,22 @@ class Experiment:
         """Write and print the results, and film the best; return the exit code."""
         failed = [Path(trial.path) for trial in trials if trial.error]
         names = [path.name for path in failed]
+        if args.storage:
+            args.storage.pull()
         try:
             baselines = play_baselines(self.env, {**self.env_config, "horizon": PAPER_HORIZON})
             # A quick run has few evaluations, of which the first ones are from before it has learned anything.
             last = LAST_QUICK if args.quick else LAST
             print(f"\n{write_report(args.results_dir, self.name, names, baselines, last)}\n")
-            print(f"In {args.results_dir}: {', '.join(FILES)}", flush=True)
-            print(film_best(args.results_dir, specs, names, last))
+            print(f"In {shown(args)}: {', '.join(FILES)}", flush=True)
+            said = film_best(args.results_dir, specs, names, last, args.storage.pull if args.storage else None)
+            print(said.replace(str(args.results_dir), shown(args)))
+            if args.storage:
+                args.storage.push()
         except FileNotFoundError as error:
             print(error)
         for path in failed:
-            print(f"FAILED: {path.name}, see {path / 'error.txt'}")
+            print(f"FAILED: {path.name}, see {shown(args)}/{path.name}/error.txt")
         # Trials that a search has stopped early are done, too.
         stops = {spec.name: spec.stop_timesteps for spec in specs}
         metrics = [(Path(trial.path).name, trial.metrics or {}) for trial in trials]
@@ -390,10 +400,13 @@ def _start_ray(args: Namespace) -> bool:
     if ray.is_initialized():
         return False
     if args.address:
+        host, _, port = args.address.removeprefix("ray://").rpartition(":")
         try:
+            if host and port.isdigit():  # Ray would try for minutes
+                socket.create_connection((host, int(port)), timeout=10).close()
             ray.init(address=args.address, log_to_driver=False, logging_level=logging.ERROR)
-        except ConnectionError as error:
-            sys.exit(f"error: --address {args.address}: {error}")
+        except (OSError, ValueError, OverflowError) as error:
+            sys.exit(f"error: --address {args.address}: no Ray cluster can be reached there ({error})")
         return True
     if args.dashboard and find_spec("aiohttp") is None:
         sys.exit('error: --dashboard needs Ray\'s dashboard: pip install -c constraints.txt "ray[default]"')
@@ -407,5 +420,15 @@ def _start_ray(args: Namespace) -> bool:
     return True
 
 
+def _check_cpus(args: Namespace) -> None:
+    """End the program if no trial could ever start: Tune would wait for more CPUs for ever."""
+    needed, found = 1 + args.num_env_runners, int(ray.cluster_resources().get("CPU", 0))
+    if found < needed:
+        sys.exit(
+            f"error: a trial needs {needed} CPUs (its own process and {args.num_env_runners} EnvRunners), and the "
+            f"cluster has {found}: lower --num-env-runners, or start more machines first"
+        )
+
+
 def _resume_command(args: Namespace) -> str:
-    return shlex.join(["python", sys.argv[0], "--resume", "--results-dir", str(args.results_dir)])
+    return shlex.join(["python", sys.argv[0], "--resume", "--results-dir", shown(args)])

@@ -14,6 +14,7 @@ from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
+from rllib_maobs.experiment.retries import COMES_AGAIN, note, raise_noted
 from rllib_maobs.learner import Diverged
 
 SHARED_POLICY = "all"
@@ -138,10 +139,20 @@ class Trial(tune.Trainable):
 
     def setup(self, config: dict[str, Any]) -> None:
         """Build the algorithm."""
+        raise_noted(self.logdir)
         spec = TrialSpec(**config)
         self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
         self._checkpoint_freq = spec.checkpoint_freq
         self._algorithm = _build(spec.build_config())
+
+    def train(self) -> dict[str, Any]:
+        """Tune's; what would come again is noted for the process in which Tune tries it once more."""
+        try:
+            result: dict[str, Any] = super().train()
+            return result
+        except COMES_AGAIN as error:
+            note(self.logdir, error)
+            raise
 
     def step(self) -> dict[str, Any]:
         """Train for one iteration; the result says whether that was the last one."""

@@ -20,6 +20,7 @@ from rllib_maobs.experiment.resume import (
     known_trials,
     lengthen,
 )
+from rllib_maobs.experiment.retries import Retries
 from rllib_maobs.experiment.search import Search, stopping
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
@@ -36,13 +37,13 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
     Returns:
         Tune's results.
     """
-    save_settings(name, args)
+    _save_settings(name, args)
     run_config = tune.RunConfig(
         name=args.results_dir.name,
-        storage_path=str(args.results_dir.parent),
+        storage_path=_storage_path(args),
         checkpoint_config=_checkpoints(),
         progress_reporter=_progress(args),
-        callbacks=make_callbacks(name, args),
+        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
         verbose=1,
     )
     tune_config = tune.TuneConfig(
@@ -79,13 +80,13 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         longer = lengthen(args.results_dir, {spec.name: spec.stop_timesteps for spec in specs})
         if longer or args.add_seeds or args.add_algos:
             print_rest(args, specs, longer)
-    save_settings(name, args)
+    _save_settings(name, args)
     rest = tune.Experiment(
         name=args.results_dir.name,
         run=Trial,
         config=_grid(others) if others else {},
         num_samples=args.num_samples if search else 1,
-        storage_path=str(args.results_dir.parent),
+        storage_path=_storage_path(args),
         checkpoint_config=_checkpoints(),
         trial_name_creator=_trial_name,
         trial_dirname_creator=_trial_name,
@@ -99,16 +100,31 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         search_alg=way,
         scheduler=_scheduler(search, specs),
         progress_reporter=_progress(args),
-        callbacks=make_callbacks(name, args),
+        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
         raise_on_failed_trial=False,
         verbose=1,
     )
     if way.restored is False:
         # Tune has gone on with no trials at all, and saved that: the state before it is still good.
+        if args.storage:
+            args.storage.pull()
         for path in {*args.results_dir.glob(STATES)} - before:
             path.unlink()
+            if args.storage:
+                args.storage.remove(path.name)
         raise StateError(NOT_RESTORED)
     return tune.ResultGrid(analysis)
+
+
+def _save_settings(name: str, args: Namespace) -> None:
+    """Write what a resumed run must know, and what was changed of its state, to where Tune reads it."""
+    save_settings(name, args)
+    if args.storage:
+        args.storage.push()
+
+
+def _storage_path(args: Namespace) -> str:
+    return args.storage.parent if args.storage else str(args.results_dir.parent)
 
 
 def _grid(specs: Sequence[TrialSpec]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from rllib_maobs.runner.acting import Acting
 from rllib_maobs.runner.callbacks import Callbacks
 from rllib_maobs.runner.episodes import EPISODE_METRICS, Episodes
 from rllib_maobs.runner.errors import EnvError, portable
-from rllib_maobs.runner.making import make_env
+from rllib_maobs.runner.making import limit_faults, make_env, replace_copy
 
 logger = logging.getLogger(__name__)
 COMPONENT_SAMPLING = "sampling"
@@ -63,6 +63,7 @@ class JointSample:
     final_recurrent_state: NDArray[np.float32] | None = None
     source: str = ""
     start: int = 0
+    failed: NDArray[np.bool_] | None = None
 
     def env_steps(self) -> int:
         """L * E."""
@@ -92,6 +93,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self.team: Team = self.config.team
         self.error: Exception | None = None
         self._failures = self._restarts = 0  # of the environment: since an episode could be sampled, and ever
+        self._failures_of_copies: dict[int, int] = {}  # each since it has ended an episode
         self.module_ids: tuple[str, ...] = self.config.module_ids
         self.env: JointEnv | None = None
         self.num_envs: int = self.config.num_envs_per_env_runner
@@ -213,7 +215,11 @@ class JointEnvRunner(EnvRunner, Checkpointable):
     def _joined(self, steps: list[_Step]) -> JointSample:
         """Steps that follow one another as columns."""
         starts, rows, finals = zip(*steps, strict=True)
+        failed = [row.pop("failed", None) for row in rows]
         columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        if any(copies is not None for copies in failed):
+            none = np.zeros(self.num_envs, dtype=np.bool_)
+            columns["failed"] = np.stack([none if copies is None else copies for copies in failed])
         final_columns = {f"final_{name}": np.concatenate([final[name] for final in finals]) for name in finals[0]}
         return JointSample(**columns, **final_columns, source=self._source, start=starts[0])
 
@@ -285,24 +291,49 @@ class JointEnvRunner(EnvRunner, Checkpointable):
 
     def _give_up_env(self, error: Exception) -> None:
         """After an error of the environment it is to be made anew; raises the error if RLlib's settings are spent."""
-        config = self.config
         self._failures += 1
+        self._tolerate(error, self._failures, "The environment")
+        self._close_env()
+
+    def _tolerate(self, error: Exception, failures: int, what: str) -> None:
+        config = self.config
         self._restarts += 1
         # A remote runner is not restarted for it: its process is sound. An illegal value would come again.
         runners = config.restart_failed_env_runners and bool(self.worker_index) and not isinstance(error, ValueError)
         limit = min(config.num_consecutive_env_runner_failures_tolerance, config.max_num_env_runner_restarts)
-        if not (config.restart_failed_sub_environments or runners) or self._failures > limit:
+        if not (config.restart_failed_sub_environments or runners) or failures > limit:
             raise error from error.__cause__
         if not isinstance(error, StepFailedRecreateEnvError):
             logger.warning(
-                "The environment of runner %s raised %r and is made anew (failure %d since an episode could be "
-                "sampled, %d are tolerated).",
+                "%s of runner %s raised %r and is made anew (failure %d since an episode could be sampled, %d are "
+                "tolerated).",
+                what,
                 self.worker_index,
                 error,
-                self._failures,
+                failures,
                 limit,
             )
-        self._close_env()
+
+    def _replace(self, errors: Mapping[int, Exception]) -> NDArray[np.bool_]:
+        """Makes copies anew whose steps have failed, and begins episodes in them; returns which they are, `(E,)`."""
+        assert self.env is not None
+        for copy, error in errors.items():
+            failures = self._failures_of_copies[copy] = self._failures_of_copies.get(copy, 0) + 1
+            self._tolerate(error, failures, f"Copy {copy} of the environment")
+        copies = np.zeros(self.num_envs, dtype=np.bool_)
+        copies[list(errors)] = True
+        try:
+            for copy in errors:
+                replace_copy(self.env, self.config, copy, self.worker_index or 0)
+        except Exception as error:
+            raise EnvError from error
+        self._callbacks.on_environment_created()
+        if self._watcher is not None:
+            self._watcher.create(copies)
+        self._obs = self._reset(copies, seed=[(seed + self._restarts) % 2**32 for seed in self._env_seeds], mask=copies)
+        self._episodes.begin(copies)
+        self.acting.forget(copies)
+        return copies
 
     def _step(
         self, explore: bool, random_actions: bool, counted: NDArray[np.bool_] | None = None
@@ -333,11 +364,20 @@ class JointEnvRunner(EnvRunner, Checkpointable):
         self._check_finite("reward", row["rewards"])
         self._steps_sampled += 1
         self.num_env_steps_sampled_lifetime += self.num_envs * max(1, self.num_workers)
+        failed = info.get("failed")
         if self._watcher is not None:
-            self._watcher.step(row, self._obs, done, info, counted)
+            looked_at = counted
+            if failed is not None:
+                looked_at = np.ones(self.num_envs, dtype=np.bool_) if counted is None else counted.copy()
+                looked_at[list(failed)] = False
+            self._watcher.step(row, self._obs, done, info, looked_at)
+        if failed is not None:
+            row["failed"] = self._replace(failed)
         if not done.any():
             return row, {name: row[name][:0] for name in ("obs", "state", "recurrent_state") if name in row}
         final = {name: values[done] for name, values in self._sight().items()}
+        if self._failures_of_copies:
+            self._failures_of_copies = {copy: n for copy, n in self._failures_of_copies.items() if not done[copy]}
         self._episodes.finish(done if counted is None else done & counted, info.get(EPISODE_METRICS, {}))
         self._episodes.begin(done)
         self.acting.forget(done)
@@ -486,6 +526,7 @@ class JointEnvRunner(EnvRunner, Checkpointable):
             self.begin_anew(sampling["_steps_sampled"])
             return
         self.env = pickle.loads(sampling["env"])
+        limit_faults(self.env, self.config)
         self.acting.set_state(sampling["acting"])
         for name in _SAMPLING_STATE:
             setattr(self, name, pickle.loads(pickle.dumps(sampling[name])))
@@ -509,6 +550,16 @@ class JointEnvRunner(EnvRunner, Checkpointable):
                 f"or were those of a remote runner)."
             )
         self._seed_anew(after)
+        self._obs, self._needs_reset = None, True
+
+    def take_over(self, env_steps: int) -> None:
+        """Starts in the place of a process that has died: schedules go on, episodes and noise are not its first ones.
+
+        Args:
+            env_steps: That the run has sampled so far.
+        """
+        self.num_env_steps_sampled_lifetime = env_steps
+        self._seed_anew(env_steps)
         self._obs, self._needs_reset = None, True
 
     @override(Checkpointable)
