@@ -23,6 +23,7 @@ from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.claim import claim
 from rllib_maobs.experiment.dashboards import check_dashboards
 from rllib_maobs.experiment.film import film_best
+from rllib_maobs.experiment.keeping import Keeper
 from rllib_maobs.experiment.plan import of_one_seed, print_plan
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
 from rllib_maobs.experiment.resume import StateError
@@ -299,13 +300,16 @@ class Experiment:
             else:
                 self._print_plan(args, specs)
             search = self._search(args) if args.search else None
-            trials = resume(self.name, args, specs, search) if args.resume else start(self.name, args, specs, search)
+            train, keeper = resume if args.resume else start, Keeper()
+            trials = train(self.name, args, specs, search, [keeper])
         finally:
             if started:
                 ray.shutdown()
         if args.search:  # Only now it is known which trials there are.
             specs = [TrialSpec(**trial.config) for trial in trials if trial.config]
-        return self._report(args, trials, specs)
+        code = self._report(args, trials, specs)
+        print(*keeper.failures, sep="\n", end="\n" if keeper.failures else "", flush=True)
+        return code
 
     def _print_kept(self, args: Namespace) -> None:
         """Say which settings of longer trials were made for their first length."""

@@ -3,16 +3,20 @@
 import contextlib
 import math
 import os
+import shutil
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from ray import tune
 from ray.rllib.algorithms import AlgorithmConfig
+from ray.train._internal.session import _TrainingResult
 from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
+from rllib_maobs.experiment.keeping import SAVING
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
 
 SHARED_POLICY = "all"
@@ -140,6 +144,7 @@ class Trial(tune.Trainable):
         spec = TrialSpec(**config)
         self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
         self._checkpoint_freq = spec.checkpoint_freq
+        self._why_not_saved = ""
         self._algorithm = _build(spec.build_config())
 
     def step(self) -> dict[str, Any]:
@@ -153,6 +158,35 @@ class Trial(tune.Trainable):
         # Tune's own frequency is one for all trials, whose iterations differ in length.
         save = (self.iteration + 1) % self._checkpoint_freq == 0
         return {**result, SCORE: score, SHOULD_CHECKPOINT: save, "done": result[STEPS] >= self._stop_timesteps}
+
+    def save(self, checkpoint_dir: str | None = None) -> Any:
+        """Save a checkpoint where Tune keeps it; if the disk is full, or broken, training goes on without.
+
+        It is written in the trial's folder, not in that of the machine's temporary files: there is one disk to be full,
+        and the next run removes what a kill leaves there.
+
+        Returns:
+            Tune's result of it, without a checkpoint if it could not be written.
+        """
+        storage = self._storage
+        if checkpoint_dir or storage is None:
+            return super().save(checkpoint_dir)
+        aside, index = Path(storage.trial_fs_path) / SAVING, storage.current_checkpoint_index
+        shutil.rmtree(aside, ignore_errors=True)
+        try:
+            return super().save(str(aside))
+        except OSError as error:
+            self._why_not_saved = error.strerror or str(error)
+            if storage.current_checkpoint_index != index:  # Tune was copying it
+                shutil.rmtree(storage.checkpoint_fs_path, ignore_errors=True)
+                storage.current_checkpoint_index = index
+            return _TrainingResult(checkpoint=None, metrics={})
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def why_not_saved(self) -> str:
+        """Return why the last checkpoint could not be written."""
+        return self._why_not_saved
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""
