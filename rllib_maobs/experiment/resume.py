@@ -17,9 +17,12 @@ from ray.train._internal.session import _TrainingResult
 from ray.tune.experiment.trial import Trial as TuneTrial
 from ray.tune.search.basic_variant import BasicVariantGenerator
 
+from rllib_maobs.experiment.claim import wait_until_free
 from rllib_maobs.experiment.keeping import LOGS, find_unfit, last_result, mend_state, put_back_logs, sweep
 from rllib_maobs.whole import numbered
 
+OUTLIVES = 30.0
+"""Seconds that a killed run's processes may live on; Ray ends them after two or three."""
 TESTED_RAY = (2, 60)
 """The release of Ray, any patch of it, whose saved state this was tried with: the range in `pyproject.toml`."""
 STATES = "experiment_state-*.json"
@@ -83,7 +86,13 @@ def take_up(results_dir: Path, kept: int) -> bool:
 
     Returns:
         Whether there is a state to go on from. If not, the run was killed before it had begun.
+
+    Raises:
+        StateError: If a process of the killed run goes on writing.
     """
+    for folder in filter(Path.is_dir, results_dir.iterdir()):
+        if not wait_until_free(folder, OUTLIVES):
+            raise StateError(f"A process of the run that was killed still writes to {folder}: end it, and try again.")
     sweep(results_dir)
     mend_state(results_dir)
     while (path := _newest(results_dir)) is not None and _read(path) is None:

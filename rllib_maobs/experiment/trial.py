@@ -16,6 +16,7 @@ from ray.train._internal.session import _TrainingResult
 from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
+from rllib_maobs.experiment.claim import hold
 from rllib_maobs.experiment.keeping import SAVING
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
 
@@ -145,6 +146,8 @@ class Trial(tune.Trainable):
         self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
         self._checkpoint_freq = spec.checkpoint_freq
         self._why_not_saved = ""
+        # Should the run be killed, this process lives on for a moment: a resumed run waits for it.
+        self._held = hold(Path(self._storage.trial_fs_path)) if self._storage else None
         self._algorithm = _build(spec.build_config())
 
     def step(self) -> dict[str, Any]:
@@ -200,6 +203,8 @@ class Trial(tune.Trainable):
     def cleanup(self) -> None:
         """Stop the algorithm."""
         self._algorithm.stop()
+        if self._held:
+            self._held.close()
 
 
 class Pace(NamedTuple):
