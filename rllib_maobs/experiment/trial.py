@@ -179,7 +179,7 @@ class Trial(tune.Trainable):
         try:
             return super().save(str(aside))
         except OSError as error:
-            self._why_not_saved = error.strerror or str(error)
+            self._why_not_saved = os.strerror(error.errno) if error.errno else str(error)
             if storage.current_checkpoint_index != index:  # Tune was copying it
                 shutil.rmtree(storage.checkpoint_fs_path, ignore_errors=True)
                 storage.current_checkpoint_index = index

@@ -21,7 +21,7 @@ from rllib_maobs.experiment.claim import wait_until_free
 from rllib_maobs.experiment.keeping import LOGS, SAVING, find_unfit
 from rllib_maobs.experiment.preemption import EXIT_CODE, Preemption
 from rllib_maobs.whole import numbered
-from tests.faults.tiny import EXPERIMENT, ITERATION, TRIAL, iterations, rows, weights
+from tests.faults.tiny import EXPERIMENT, ITERATION, TRIAL, flip, iterations, rows, uninterrupted, weights
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -60,8 +60,12 @@ def newest(folder: Path) -> int:
     return max((int(path.name[-6:]) for path in numbered(folder / TRIAL)), default=-1)
 
 
-def kill(folder: Path, when: str, chance: random.Random, *given: str) -> None:
-    """Start the program and kill it: while it starts, saves, has Tune copy the checkpoint, or at any moment."""
+def kill(folder: Path, when: str, chance: random.Random, *given: str) -> str:
+    """Start the program and kill it: while it starts, saves, has Tune copy the checkpoint, or at any moment.
+
+    Returns:
+        What it has printed.
+    """
     before, trial = newest(folder), folder / TRIAL
     with program(folder, *given) as process:
         if when == "start":
@@ -79,33 +83,18 @@ def kill(folder: Path, when: str, chance: random.Random, *given: str) -> None:
             time.sleep(chance.uniform(0.0, 1.0))
         assert process.poll() is None, process.stdout and process.stdout.read()
         process.kill()
-
-
-@pytest.fixture(scope="module")
-def steps(pytestconfig: pytest.Config) -> int:
-    from tests.conftest import is_long
-
-    return ITERATION * (120 if is_long(pytestconfig) else 16)
-
-
-@pytest.fixture(scope="module")
-def whole(ray_session: None, steps: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The training without any interruption."""
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    train(folder, "--quick", "--no-compile", "--stop-timesteps", str(steps), "--checkpoint-freq", "1000")
-    return folder
+        return process.stdout.read() if process.stdout else ""
 
 
 def test_a_training_that_is_killed_again_and_again(
-    whole: Path,
-    steps: int,
+    ray_session: None,
     tmp_path: Path,
     long: bool,
     tally: Counter[str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """First ended by SIGTERM, then killed and resumed: it ends with the rows and weights of the uninterrupted one."""
-    folder, chance = tmp_path / "a [killed] run", random.Random(0)
+    folder, chance, steps = tmp_path / "a [killed] run", random.Random(0), ITERATION * (120 if long else 16)
     stop = threading.Timer(0.0, lambda: (wait_for(lambda: newest(folder) >= 1), os.kill(os.getpid(), signal.SIGTERM)))
     stop.start()
     with pytest.raises(SystemExit) as end:
@@ -114,11 +103,17 @@ def test_a_training_that_is_killed_again_and_again(
     assert end.value.code == EXIT_CODE == 143
     assert "SIGTERM: every trial is saved" in (said := capsys.readouterr().out)
     assert "Ended by SIGTERM. Go on with: python " in said
-    assert find_unfit(folder / TRIAL / f"checkpoint_{newest(folder):06d}") is None
-    moments = ["start", "any", "save", "copy"] * 5 if long else ["save", "copy"]
-    for when in moments:
-        kill(folder, when, chance, "--resume")
+    damaged = numbered(folder / TRIAL)[0]
+    assert find_unfit(damaged) is None
+    flip(damaged / "replay_buffer" / "state.pkl", bit=1000)
+    moments = ["any", "save", "start", "copy"] * 5 if long else ["save", "copy"]
+    for number, when in enumerate(moments):
+        said = kill(folder, when, chance, "--resume")
         tally["kills survived"] += 1
+        if number == 0:
+            found = "is no whole checkpoint: replay_buffer/state.pkl has changed since it was saved (another checksum)"
+            assert f"{TRIAL}: {damaged} {found} (it is kept as damaged_{damaged.name}); the one before it is" in said
+            assert damaged.with_name(f"damaged_{damaged.name}").is_dir()
     assert wait_until_free(folder / TRIAL, 10.0), "its processes live on"
     train(folder, "--resume")
 
@@ -127,11 +122,14 @@ def test_a_training_that_is_killed_again_and_again(
         assert found == expected, name
         tally["rows duplicated"] += len(found) - len(set(found))
         tally["rows lost"] += len(set(expected) - set(found))
-    assert rows(folder) == rows(whole)
+    results, networks = uninterrupted(steps)
+    assert rows(folder) == results
     tally["steps lost"] += steps - ITERATION * iterations(folder)["result.json"][-1]
     there = weights(folder)
-    assert there.keys() == weights(whole).keys()
-    assert all(torch.equal(there[name], value) for name, value in weights(whole).items())
+    assert there.keys() == networks.keys()
+    assert all(torch.equal(there[name], value) for name, value in networks.items())
+    checkpoint = folder / TRIAL / f"checkpoint_{newest(folder):06d}"
+    assert (checkpoint / LOGS / "result.json").read_text() == (folder / TRIAL / "result.json").read_text()
 
 
 def test_a_second_sigterm_ends_at_once() -> None:
@@ -143,10 +141,40 @@ def test_a_second_sigterm_ends_at_once() -> None:
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+def test_a_run_goes_on_while_the_disk_is_full(
+    ray_session: None, tmp_path: Path, long: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A small disk that has room for two checkpoints."""
+    if not long:
+        pytest.skip("in the long form only; tests/faults/test_torn.py has a trial that cannot save")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=4600k", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no rights to mount a tmpfs; tests/faults/test_torn.py has a limit of the process in its place")
+    try:
+        train(folder, "--quick", "--no-compile", "--stop-timesteps", "240", "--checkpoint-freq", "1")
+        assert iterations(folder)["result.json"] == list(range(1, 11))
+        there = [int(path.name[-6:]) + 1 for path in numbered(folder / TRIAL)]  # saved after which iteration
+        assert len(there) == 2 and max(there) < 10
+        assert all(find_unfit(path) is None for path in numbered(folder / TRIAL))
+        assert {path.name for path in (folder / TRIAL).glob(".*")} <= {".lock"}
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+    told = [
+        f"The checkpoint of {TRIAL} at {ITERATION * iteration} env steps could not be written (No space left on device); "
+        f"training goes on, and the one before it stays."
+        for iteration in range(max(there) + 1, 11)
+    ]
+    said = capsys.readouterr().out
+    assert said.endswith("\n".join(told) + "\n")
+    assert [said.count(sentence) for sentence in told] == [2] * len(told)
+
+
 def test_the_children_of_a_killed_run_end(tmp_path: Path, long: bool) -> None:
     """One that has started Ray itself; the trial's process is gone before a resumed run reads what it has written."""
     if not long:
-        return  # The other test kills runs on a Ray that lives on.
+        pytest.skip("in the long form only: it starts a Ray of its own")
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "tests.faults.tiny", "--results-dir", str(folder), "--quick", "--no-compile"]
     given = ["--stop-timesteps", "24000", "--checkpoint-freq", "1"]
@@ -164,8 +192,3 @@ def test_the_children_of_a_killed_run_end(tmp_path: Path, long: bool) -> None:
     there = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     time.sleep(1.0)
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == there
-
-
-def test_the_logs_are_those_of_the_checkpoint(whole: Path) -> None:
-    (checkpoint,) = numbered(whole / TRIAL)
-    assert (checkpoint / LOGS / "result.json").read_text() == (whole / TRIAL / "result.json").read_text()

@@ -1,6 +1,7 @@
 """A training that takes seconds, as a program that tests kill, and what is compared of its results."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from rllib_maobs.checkpoints import find_checkpoint, module_folders
 from rllib_maobs.experiment import Experiment
+from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.report import STEPS
+from rllib_maobs.experiment.trial import Trial
 
 TRIAL = "tiny-seed0"
 ITERATION = 24  # env steps
@@ -36,21 +39,17 @@ EXPERIMENT = Experiment(
 )
 
 
+def timeless(result: dict[str, Any]) -> str:
+    """What a result says of training and evaluation, as text (NaN is NaN), but for how fast the machine was."""
+    evaluated = result["evaluation"]["env_runners"]["episode_metrics"]
+    learned = {agent: values for agent, values in result["learners"].items() if agent.startswith("agent_")}
+    numbers = [result["training_iteration"], result[STEPS], result["score"], evaluated, learned]
+    return json.dumps(numbers, sort_keys=True, default=float)
+
+
 def rows(folder: Path) -> list[str]:
-    """What each result says of training and evaluation, as text (NaN is NaN), but for how fast the machine was."""
-    found = []
-    for line in (folder / TRIAL / "result.json").read_text().splitlines():
-        result = json.loads(line)
-        learned = {agent: values for agent, values in result["learners"].items() if agent.startswith("agent_")}
-        timeless = [result["training_iteration"], result[STEPS], result["evaluation"]["env_runners"], learned]
-        found.append(json.dumps(without_times(timeless), sort_keys=True))
-    return found
-
-
-def without_times(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: without_times(v) for key, v in value.items() if "time" not in key and "_sec" not in key}
-    return [without_times(v) for v in value] if isinstance(value, list) else value
+    """The results that a run has logged."""
+    return [timeless(json.loads(line)) for line in (folder / TRIAL / "result.json").read_text().splitlines()]
 
 
 def iterations(folder: Path) -> dict[str, list[int]]:
@@ -73,6 +72,31 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
         for mid, path in module_folders(find_checkpoint(folder / TRIAL)).items()
         for name, value in RLModule.from_checkpoint(path).state_dict().items()
     }
+
+
+def uninterrupted(steps: int) -> tuple[list[str], dict[str, torch.Tensor]]:
+    """The results and the networks of a training in this process."""
+    arguments = ["--quick", "--no-compile", "--stop-timesteps", str(steps)]
+    parser = make_parser("tiny", EXPERIMENT.algorithms, 1000)
+    (spec,) = EXPERIMENT.specs(parse(parser, "tiny", [*arguments, "--results-dir", "/nowhere"]))
+    trial = Trial(config=asdict(spec))
+    try:
+        results = [timeless(trial.train()) for _ in range(steps // ITERATION)]
+        modules = trial._algorithm.learner_group._learner.module
+        return results, {
+            f"{mid}.{name}": value
+            for mid in modules.keys()
+            for name, value in modules[mid].unwrapped().state_dict().items()
+        }
+    finally:
+        trial.stop()
+
+
+def flip(path: Path, bit: int) -> None:
+    """Change one bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
 
 
 if __name__ == "__main__":
