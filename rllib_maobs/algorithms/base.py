@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import pickle
 import tempfile
@@ -45,7 +46,11 @@ from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raise_kept, raised_as_themselves
 from rllib_maobs.whole import CHECKSUMS, first_whole, with_those_before, written_aside
 
+logger = logging.getLogger(__name__)
+
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
+LARGE_REPLAY = 2e9
+"""Bytes of replay from which on a checkpoint is worth a warning: some seconds, each time it is saved."""
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many. Those of long windows are
 # larger, so there are fewer.
 _ROWS_PER_DRAW = 16_384
@@ -96,7 +101,7 @@ class JointAlgorithm(AnyPath, Algorithm):
                 raise_kept(group)  # of environments that could not be made
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
-        self._rounds_without_samples = 0
+        self._rounds_without_samples, self._warned_of_size = 0, False
         self._custom_metrics: dict[str, Any] = {}
         self._progress: dict[str, Any] = {
             "env_steps": 0,
@@ -294,11 +299,24 @@ class JointAlgorithm(AnyPath, Algorithm):
         """
         if path is None:
             path = Path(tempfile.gettempdir()) / str(uuid.uuid4())
+        self._warn_of_size()
         if (folder := _local_folder(path, filesystem)) is None:
             return super().save_to_path(path, filesystem=filesystem, **kwargs)
         with written_aside(folder) as aside:
             super().save_to_path(aside, **kwargs)
         return str(folder)
+
+    def _warn_of_size(self) -> None:
+        """Says once what a large replay buffer makes of checkpoints, and what leaving it out costs."""
+        held = self.replay_buffer.nbytes * len(self.replay_buffer) / self.replay_buffer.capacity
+        if self.config.store_buffer_in_checkpoints and held > LARGE_REPLAY and not self._warned_of_size:
+            self._warned_of_size = True
+            logger.warning(
+                f"Every checkpoint of this run holds {held / 1e9:.1f} GB of replay, and training waits while it is "
+                f"written. training(store_buffer_in_checkpoints=False) leaves it out; then a restored run first "
+                f"collects {self._steps_before_learning():,} env steps anew, and learns from few of them for a while: "
+                f"it does not go on as the first would have."
+            )
 
     @classmethod
     @override(AnyPath)

@@ -162,8 +162,8 @@ def test_a_run_goes_on_while_the_disk_is_full(
     finally:
         subprocess.run(["umount", str(folder)], check=True)
     told = [
-        f"The checkpoint of {TRIAL} at {ITERATION * iteration} env steps could not be written (No space left on device); "
-        f"training goes on, and the one before it stays."
+        f"The checkpoint of {TRIAL} at {ITERATION * iteration} env steps could not be written (No space left on device)"
+        f"; training goes on, and the one before it stays."
         for iteration in range(max(there) + 1, 11)
     ]
     said = capsys.readouterr().out

@@ -188,6 +188,18 @@ def test_a_full_disk_leaves_the_old_checkpoint(saved: SimpleNamespace, trial: Pa
     assert sorted(path.name for path in trial.iterdir()) == [f"checkpoint_00000{number}" for number in range(3)]
 
 
+def test_a_large_replay_buffer_is_warned_of_once(
+    saved: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("rllib_maobs.algorithms.base.LARGE_REPLAY", 1e3)
+    for _ in range(2):
+        saved.algorithm.save_to_path(tmp_path / "checkpoint")
+    (warning,) = [text for text in caplog.messages if "GB of replay" in text]
+    assert (
+        "store_buffer_in_checkpoints=False) leaves it out; then a restored run first collects 16 env steps" in warning
+    )
+
+
 @pytest.mark.parametrize("when", ["writing", "copying"])
 def test_a_trial_goes_on_without_a_checkpoint(
     ray_session: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
