@@ -13,6 +13,7 @@ from ray.rllib.core.rl_module import RLModule
 from rllib_maobs.algorithms import JointAlgorithm, JointConfig
 from rllib_maobs.algorithms.checks import built_modules
 from rllib_maobs.learner.networks import MIXER
+from rllib_maobs.whole import METADATA, first_whole, numbered, with_those_before
 
 logger = logging.getLogger(__name__)
 _MODULES = ("learner_group", "learner", "rl_module")
@@ -22,17 +23,18 @@ def find_checkpoint(path: str | Path) -> Path:
     """Return the folder of an algorithm's checkpoint.
 
     Args:
-        path: The folder itself, or a trial's with checkpoints in it, of which the last one counts.
+        path: The folder itself, or a trial's with checkpoints in it, of which the last one counts. In the place of a
+            torn or damaged one the one before it counts, with a warning.
 
     Raises:
-        ValueError: If it is neither.
+        ValueError: If it is neither, or no checkpoint there is whole.
     """
     if not str(path):  # which would be the present folder
         raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
     folder = Path(path).expanduser().resolve()
-    for found in (folder, *sorted(folder.glob("checkpoint_*"), reverse=True)):
-        if found.joinpath(*_MODULES).is_dir():
-            return found
+    candidates = with_those_before(folder) if (folder / METADATA).exists() else numbered(folder)
+    if candidates and (found := first_whole(*candidates)).joinpath(*_MODULES).is_dir():
+        return found
     trials = sorted({str(trial.parent.name) for trial in folder.glob("*/checkpoint_*")}) if folder.is_dir() else []
     inside = f" Trials in it are {', '.join(trials)}." if trials else ""
     raise ValueError(

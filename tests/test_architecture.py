@@ -13,12 +13,13 @@ ALLOWED = {
     "options": set(),
     "paths": set(),
     "registry": {"options"},
+    "whole": set(),
     "envs": FOUNDATION,
     "modules": FOUNDATION,
     "replay": {"options"},
     "runner": {*FOUNDATION, "envs", "modules"},
     "learner": {*FOUNDATION, "modules", "replay"},
-    "algorithms": {*FOUNDATION, "envs", "modules", "replay", "runner", "learner"},
+    "algorithms": {*FOUNDATION, "envs", "modules", "replay", "runner", "learner", "whole"},
 }
 
 

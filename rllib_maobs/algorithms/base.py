@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import pickle
+import tempfile
+import uuid
 from collections.abc import Collection
 from numbers import Integral
 from pathlib import Path
@@ -43,9 +45,12 @@ from rllib_maobs.learner import Diverged, JointLearner
 from rllib_maobs.paths import AnyPath, absolute
 from rllib_maobs.replay import JointReplayBuffer
 from rllib_maobs.runner import JointSample, raise_kept, raised_as_themselves
+from rllib_maobs.whole import CHECKSUMS, first_whole, with_those_before, written_aside
 
 logger = logging.getLogger(__name__)
 COMPONENT_REPLAY_BUFFER = "replay_buffer"
+LARGE_REPLAY = 2e9
+"""Bytes of replay from which on a checkpoint is worth a warning: some seconds, each time it is saved."""
 # Minibatches are drawn several at a time, up to this many rows: one gather instead of many. Those of long windows are
 # larger, so there are fewer.
 _ROWS_PER_DRAW = 16_384
@@ -98,7 +103,7 @@ class JointAlgorithm(AnyPath, Algorithm):
             if group is not None and group.local_env_runner is not None:
                 group.local_env_runner.share(self._learner.acting, self._learner.normalizers)
         self._rounds_without_samples = 0
-        self._warned_of_values = False
+        self._warned_of_values = self._warned_of_size = False
         self._custom_metrics: dict[str, Any] = {}
         self._progress: dict[str, Any] = {
             "env_steps": 0,
@@ -330,11 +335,63 @@ class JointAlgorithm(AnyPath, Algorithm):
         self.setup(config)
 
     @override(Algorithm)
+    def get_metadata(self) -> dict[str, Any]:
+        """RLlib's, and that a checkpoint has checksums: one whose list of them is missing is recognised."""
+        return {**super().get_metadata(), "checksums": CHECKSUMS}
+
+    @override(AnyPath)
+    def save_to_path(self, path: Any = None, *, filesystem: Any = None, **kwargs: Any) -> str:
+        """RLlib's. In a local folder the checkpoint is written aside, with checksums, and renamed into place.
+
+        Whatever happens meanwhile, the checkpoint that was there before stays until the new one is whole.
+
+        Returns:
+            The path.
+        """
+        if path is None:
+            path = Path(tempfile.gettempdir()) / str(uuid.uuid4())
+        self._warn_of_size()
+        if (folder := _local_folder(path, filesystem)) is None:
+            return super().save_to_path(path, filesystem=filesystem, **kwargs)
+        with written_aside(folder) as aside:
+            super().save_to_path(aside, **kwargs)
+        return str(folder)
+
+    def _warn_of_size(self) -> None:
+        """Says once what a large replay buffer makes of checkpoints, and what leaving it out costs."""
+        held = self.replay_buffer.nbytes * len(self.replay_buffer) / self.replay_buffer.capacity
+        if self.config.store_buffer_in_checkpoints and held > LARGE_REPLAY and not self._warned_of_size:
+            self._warned_of_size = True
+            logger.warning(
+                f"Every checkpoint of this run holds {held / 1e9:.1f} GB of replay, and training waits while it is "
+                f"written. training(store_buffer_in_checkpoints=False) leaves it out; then a restored run first "
+                f"collects {self._steps_before_learning():,} env steps anew, and learns from few of them for a while: "
+                f"it does not go on as the first would have."
+            )
+
+    @classmethod
+    @override(AnyPath)
+    def from_checkpoint(cls, path: Any, filesystem: Any = None, **kwargs: Any) -> Any:
+        """RLlib's; in the place of a torn checkpoint the one before it is used, with a warning.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        return super().from_checkpoint(_whole(path, filesystem), filesystem=filesystem, **kwargs)
+
+    @override(Algorithm)
     def restore_from_path(
         self, path: str | Path, *args: Any, component: str | None = None, filesystem: Any = None, **kwargs: Any
     ) -> None:
-        """Goes on from a checkpoint, in the order of agents that it was made in."""
+        """Goes on from a checkpoint, in the order of agents that it was made in.
+
+        In the place of a torn or damaged one the one before it is used, with a warning.
+
+        Raises:
+            ValueError: If there is none, or it does not fit this configuration.
+        """
         if component is None:
+            path = _whole(path, filesystem)
             files, folder = (filesystem, path) if filesystem else FileSystem.from_uri(absolute(path))
             saved = f"{folder}/{self.CLASS_AND_CTOR_ARGS_FILE_NAME}"
             if files.get_file_info(saved).type == FileType.File:
@@ -452,3 +509,17 @@ class JointAlgorithm(AnyPath, Algorithm):
         if self.config.store_buffer_in_checkpoints:
             components.append((COMPONENT_REPLAY_BUFFER, self.replay_buffer))
         return components
+
+
+def _local_folder(path: Any, filesystem: Any) -> Path | None:
+    """The folder of a path on this machine; None for one elsewhere."""
+    local = absolute(path) if filesystem is None else None
+    return Path(local) if isinstance(local, str) and "://" not in local else None
+
+
+def _whole(path: Any, filesystem: Any) -> Any:
+    """The path of a checkpoint or, if it is torn and on this machine, that of the one before it."""
+    folder = _local_folder(path, filesystem)
+    candidates = [] if folder is None else with_those_before(folder)
+    # RLlib says itself what is not there at all.
+    return first_whole(*candidates) if len(candidates) > 1 or any(map(Path.is_dir, candidates)) else path

@@ -12,6 +12,7 @@ from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
 from rllib_maobs.experiment.storage import Storage, is_url
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
+from rllib_maobs.paths import write_aside
 
 _FILE = "experiment.json"
 _BEFORE_START = (_FILE, "tuner.pkl", "mlflow.db", LOCK)  # What is written before the first trial starts.
@@ -44,7 +45,8 @@ def save_settings(name: str, args: argparse.Namespace) -> None:
         args: From `parse`.
     """
     settings = {setting: getattr(args, setting) for setting in SETTINGS}
-    (args.results_dir / _FILE).write_text(json.dumps({"experiment": name, **settings}, indent=2) + "\n")
+    text = json.dumps({"experiment": name, **settings}, indent=2) + "\n"
+    write_aside(args.results_dir / _FILE, text.encode())
 
 
 def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:

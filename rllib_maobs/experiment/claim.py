@@ -3,6 +3,7 @@
 import contextlib
 import os
 import socket
+import time
 from pathlib import Path
 from typing import TextIO
 
@@ -51,3 +52,47 @@ def claim(folder: Path) -> TextIO:
         file.truncate(0)
         print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
     return file
+
+
+def hold(folder: Path) -> TextIO | None:
+    """Mark a trial's folder as one that this process writes to.
+
+    Args:
+        folder: The folder.
+
+    Returns:
+        An open file; while it is open, the folder is marked. None where there are no locks.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a")
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return None
+    return file
+
+
+def wait_until_free(folder: Path, seconds: float) -> bool:
+    """Wait until no process holds a trial's folder: those of a killed run end a few seconds after it.
+
+    Args:
+        folder: The folder.
+        seconds: How long to wait.
+
+    Returns:
+        Whether it is free.
+    """
+    deadline = time.monotonic() + seconds
+    while fcntl is not None and (folder / LOCK).exists():
+        with (folder / LOCK).open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    return False
+            except OSError:  # some network file systems have no locks
+                return True
+        time.sleep(0.1)
+    return True

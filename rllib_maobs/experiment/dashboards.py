@@ -185,6 +185,7 @@ class TensorBoard(TBXLoggerCallback):
         image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
         summary = Summary(value=[Summary.Value(tag="episode", image=image)])
         self._trial_writer[trial].file_writer.add_summary(summary, steps)
+        self._trial_writer[trial].flush()
 
     def log_trial_end(self, trial: Any, failed: bool = False) -> None:
         """Write the settings, and what came of them."""

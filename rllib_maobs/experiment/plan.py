@@ -123,8 +123,8 @@ def _measured(args: Namespace, specs: Sequence[TrialSpec], count: int) -> tuple[
         f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
         f"compiling.\n"
         f"Estimated: {'at most ' if args.search else ''}{total / 3600:.2f} hours for all, {at_once} at once.\n"
-        f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and as much of disk in its "
-        f"checkpoint{free}."
+        f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and twice that of disk in its two "
+        f"checkpoints{free}."
     )
 
 

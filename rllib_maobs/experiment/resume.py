@@ -2,6 +2,8 @@
 
 import glob
 import json
+import re
+import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,8 +12,17 @@ from typing import Any
 import ray
 from ray import tune
 from ray.rllib.utils.annotations import override
+from ray.train._internal.checkpoint_manager import _CheckpointManager
+from ray.train._internal.session import _TrainingResult
+from ray.tune.experiment.trial import Trial as TuneTrial
 from ray.tune.search.basic_variant import BasicVariantGenerator
 
+from rllib_maobs.experiment.claim import wait_until_free
+from rllib_maobs.experiment.keeping import LOGS, find_unfit, last_result, mend_state, put_back_logs, sweep
+from rllib_maobs.whole import numbered
+
+OUTLIVES = 30.0
+"""Seconds that a killed run's processes may live on; Ray ends them after two or three."""
 TESTED_RAY = (2, 60)
 """The release of Ray, any patch of it, whose saved state this was tried with: the range in `pyproject.toml`."""
 STATES = "experiment_state-*.json"
@@ -60,6 +71,86 @@ class Grid(BasicVariantGenerator):
         self.restored, self._rest = True, None
         if rest is not None:
             self.add_configurations([rest])
+
+
+def take_up(results_dir: Path, kept: int) -> bool:
+    """Make Tune's saved state, the trials' checkpoints and their logs fit together, whenever the run was killed.
+
+    Tune goes on from the state that it saved last, which may know less than there is on disk, or be torn. What is on
+    disk decides: each trial goes on from its newest checkpoint that is whole and has its logs. Newer ones that are not
+    are removed; one that was whole once is put aside as "damaged_...".
+
+    Args:
+        results_dir: The folder of the run.
+        kept: Checkpoints that a trial keeps.
+
+    Returns:
+        Whether there is a state to go on from. If not, the run was killed before it had begun.
+
+    Raises:
+        StateError: If a process of the killed run goes on writing.
+    """
+    for folder in filter(Path.is_dir, results_dir.iterdir()):
+        if not wait_until_free(folder, OUTLIVES):
+            raise StateError(f"A process of the run that was killed still writes to {folder}: end it, and try again.")
+    sweep(results_dir)
+    mend_state(results_dir)
+    while (path := _newest(results_dir)) is not None and _read(path) is None:
+        path.unlink()  # torn, and there is no copy
+    if path is None:
+        return False
+    if not ray.__version__.startswith(f"{'.'.join(map(str, TESTED_RAY))}."):
+        return True  # forget_decisions says so
+    state = _read(path)
+    if _decisions(state) is None:
+        return True
+    for entry in state["trial_data"]:
+        trial = TuneTrial.from_json_state(entry[0], stub=True)
+        trial.stub = False
+        trial.restore_run_metadata(entry[1])
+        if _take_up_trial(trial, results_dir / trial.storage.trial_dir_name, kept):
+            trial.invalidate_json_state()
+            entry[:] = trial.get_json_state()
+    _replace(path, state)
+    return True
+
+
+def _take_up_trial(trial: Any, folder: Path, kept: int) -> bool:
+    """Let a trial of Tune's state go on from what is on disk; return whether its state has changed."""
+    found, unfit = numbered(folder), list[tuple[Path, str]]()
+    while found and (fault := find_unfit(found[0])):
+        unfit.append((found.pop(0), fault))
+    _put_aside(str(trial), unfit, found[0] if found else None)
+    if found and not (found[0] / LOGS).is_dir():
+        return False  # saved by a revision that kept no logs: only Tune knows what it belongs to
+    config, known = trial.run_metadata.checkpoint_manager.checkpoint_config, trial.run_metadata.last_result
+    config.num_to_keep = kept
+    manager = _CheckpointManager(config)
+    for path in reversed(found):
+        result = last_result(path) if (path / LOGS).is_dir() else {}
+        manager.register_checkpoint(_TrainingResult(tune.Checkpoint(str(path)), result))
+    last = manager.latest_checkpoint_result.metrics if found else {}
+    trial.run_metadata.checkpoint_manager, trial.run_metadata.last_result = manager, last
+    trial.storage.current_checkpoint_index = int(re.sub(r"\D", "", found[0].name)) if found else -1
+    if trial.status != TuneTrial.ERROR or last.get("done"):
+        trial.status = TuneTrial.TERMINATED if last.get("done") else TuneTrial.PENDING
+    if trial.status == TuneTrial.TERMINATED:
+        put_back_logs(found[0], folder, finished=True)
+    return bool(found or known)
+
+
+def _put_aside(trial: str, unfit: list[tuple[Path, str]], used: Path | None) -> None:
+    for path, fault in unfit:
+        was_whole = (path / LOGS).is_dir()
+        if was_whole:
+            path.rename(path.with_name(f"damaged_{path.name}"))
+        else:  # the run was killed while it wrote this one
+            shutil.rmtree(path)
+        goes_on = (
+            f"the one before it is used: {used.name}" if used else "there is none before it: the trial starts anew"
+        )
+        kept = f" (it is kept as damaged_{path.name})" if was_whole else ""
+        print(f"{trial}: {path} is no whole checkpoint: {fault}{kept}; {goes_on}.", flush=True)
 
 
 def forget_decisions(results_dir: Path) -> None:

@@ -24,7 +24,9 @@ from rllib_maobs.experiment.baselines import play_baselines
 from rllib_maobs.experiment.claim import claim
 from rllib_maobs.experiment.dashboards import check_dashboards
 from rllib_maobs.experiment.film import film_best
+from rllib_maobs.experiment.keeping import Keeper
 from rllib_maobs.experiment.plan import of_one_seed, print_plan
+from rllib_maobs.experiment.preemption import EXIT_CODE, Preemption
 from rllib_maobs.experiment.report import FILES, LAST, LAST_QUICK, STEPS, write_report
 from rllib_maobs.experiment.resume import StateError
 from rllib_maobs.experiment.rows import OF_THE_TRIAL, PAPER_HORIZON, check_row, options_before, settings_of_row, takes
@@ -141,7 +143,8 @@ class Experiment:
             argv: Arguments; None for those of the program.
 
         Raises:
-            SystemExit: With code 1 if a trial failed, 2 for wrong arguments, 130 if it was interrupted.
+            SystemExit: With code 1 if a trial failed, 2 for wrong arguments, 130 if it was interrupted, 143 if SIGTERM
+                ended it (all trials are saved then).
         """
         doc = f"Train on {self.env}."
         parser = make_parser(self.name, self.algorithms, self.stop_timesteps, doc, self.quick_algorithms)
@@ -304,13 +307,22 @@ class Experiment:
             else:
                 self._print_plan(args, specs)
             search = self._search(args) if args.search else None
-            trials = resume(self.name, args, specs, search) if args.resume else start(self.name, args, specs, search)
+            train, keeper = resume if args.resume else start, Keeper()
+            with Preemption() as preemption:
+                # What is at a URL is Tune's alone.
+                callbacks = [preemption] if args.storage else [keeper, preemption]
+                trials = train(self.name, args, specs, search, callbacks)
         finally:
             if started:
                 ray.shutdown()
+        if preemption.came:  # There may be no time for a report.
+            print(*keeper.failures, f"Ended by SIGTERM. Go on with: {_resume_command(args)}", sep="\n", flush=True)
+            return EXIT_CODE
         if args.search:  # Only now it is known which trials there are.
             specs = [TrialSpec(**trial.config) for trial in trials if trial.config]
-        return self._report(args, trials, specs)
+        code = self._report(args, trials, specs)
+        print(*keeper.failures, sep="\n", end="\n" if keeper.failures else "", flush=True)
+        return code
 
     def _print_kept(self, args: Namespace) -> None:
         """Say which settings of longer trials were made for their first length."""

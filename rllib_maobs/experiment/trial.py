@@ -3,16 +3,22 @@
 import contextlib
 import math
 import os
+import shutil
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from pyarrow.fs import LocalFileSystem
 from ray import tune
 from ray.rllib.algorithms import AlgorithmConfig
+from ray.train._internal.session import _TrainingResult
 from ray.tune.result import SHOULD_CHECKPOINT
 
 import rllib_maobs as maobs
+from rllib_maobs.experiment.claim import hold
+from rllib_maobs.experiment.keeping import SAVING
 from rllib_maobs.experiment.report import SCORE, STEPS, evaluation_metrics
 from rllib_maobs.experiment.retries import COMES_AGAIN, note, raise_noted
 from rllib_maobs.learner import Diverged
@@ -143,6 +149,10 @@ class Trial(tune.Trainable):
         spec = TrialSpec(**config)
         self._stop_timesteps, self._start_from = spec.stop_timesteps, spec.start_from
         self._checkpoint_freq = spec.checkpoint_freq
+        self._why_not_saved = ""
+        # Should the run be killed, this process lives on for a moment: a resumed run waits for it.
+        folder = self._folder()
+        self._held = None if folder is None else hold(folder)
         self._algorithm = _build(spec.build_config())
 
     def train(self) -> dict[str, Any]:
@@ -170,6 +180,12 @@ class Trial(tune.Trainable):
         save = (self.iteration + 1) % self._checkpoint_freq == 0
         return {**result, SCORE: score, SHOULD_CHECKPOINT: save, "done": result[STEPS] >= self._stop_timesteps}
 
+    def _folder(self) -> Path | None:
+        """Return the trial's folder; None where there is none, or where it is at a URL."""
+        storage = self._storage
+        local = storage is not None and isinstance(storage.storage_filesystem, LocalFileSystem)
+        return Path(storage.trial_fs_path) if local else None
+
     def _keep(self, error: Diverged) -> None:
         """Put what a post-mortem needs into the trial's folder, wherever that is."""
         if self._storage is not None and error.evidence:
@@ -177,6 +193,35 @@ class Trial(tune.Trainable):
             with self._storage.storage_filesystem.open_output_stream(path) as file:
                 file.write(error.evidence)
             error.kept_as(path)
+
+    def save(self, checkpoint_dir: str | None = None) -> Any:
+        """Save a checkpoint where Tune keeps it; if the disk is full, or broken, training goes on without.
+
+        It is written in the trial's folder, not in that of the machine's temporary files: there is one disk to be full,
+        and the next run removes what a kill leaves there.
+
+        Returns:
+            Tune's result of it, without a checkpoint if it could not be written.
+        """
+        storage, folder = self._storage, self._folder()
+        if checkpoint_dir or folder is None:
+            return super().save(checkpoint_dir)
+        aside, index = folder / SAVING, storage.current_checkpoint_index
+        shutil.rmtree(aside, ignore_errors=True)
+        try:
+            return super().save(str(aside))
+        except OSError as error:
+            self._why_not_saved = os.strerror(error.errno) if error.errno else str(error)
+            if storage.current_checkpoint_index != index:  # Tune was copying it
+                shutil.rmtree(storage.checkpoint_fs_path, ignore_errors=True)
+                storage.current_checkpoint_index = index
+            return _TrainingResult(checkpoint=None, metrics={})
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def why_not_saved(self) -> str:
+        """Return why the last checkpoint could not be written."""
+        return self._why_not_saved
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save the algorithm."""
@@ -190,6 +235,8 @@ class Trial(tune.Trainable):
     def cleanup(self) -> None:
         """Stop the algorithm."""
         self._algorithm.stop()
+        if self._held:
+            self._held.close()
 
 
 class Pace(NamedTuple):

@@ -19,13 +19,23 @@ from rllib_maobs.experiment.resume import (
     forget_decisions,
     known_trials,
     lengthen,
+    take_up,
 )
 from rllib_maobs.experiment.retries import Retries
 from rllib_maobs.experiment.search import Search, stopping
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
+# The last one, and the one before it, should that be damaged.
+KEPT = 2
 
-def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search | None = None) -> tune.ResultGrid:
+
+def start(
+    name: str,
+    args: Namespace,
+    specs: Sequence[TrialSpec],
+    search: Search | None = None,
+    callbacks: Sequence[tune.Callback] = (),
+) -> tune.ResultGrid:
     """Train all trials.
 
     Args:
@@ -33,6 +43,7 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
         args: Of the command line.
         specs: The trials; those of a search are its own.
         search: Proposes trials, one after the other.
+        callbacks: Called before those of the dashboards.
 
     Returns:
         Tune's results.
@@ -43,7 +54,7 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
         storage_path=_storage_path(args),
         checkpoint_config=_checkpoints(),
         progress_reporter=_progress(args),
-        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
+        callbacks=[*callbacks, Retries(args.max_failures), *make_callbacks(name, args)],
         verbose=1,
     )
     tune_config = tune.TuneConfig(
@@ -57,7 +68,13 @@ def start(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search
     return tune.Tuner(Trial, param_space=space, tune_config=tune_config, run_config=run_config).fit()
 
 
-def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Search | None = None) -> tune.ResultGrid:
+def resume(
+    name: str,
+    args: Namespace,
+    specs: Sequence[TrialSpec],
+    search: Search | None = None,
+    callbacks: Sequence[tune.Callback] = (),
+) -> tune.ResultGrid:
     """Go on with the trials in a results folder, from their last checkpoints.
 
     Args:
@@ -65,6 +82,7 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         args: Of the command line.
         specs: The trials. Those that the folder does not hold are started, those that are longer now go on.
         search: As for `start`.
+        callbacks: As for `start`.
 
     Returns:
         Tune's results.
@@ -72,6 +90,9 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
     Raises:
         StateError: If the folder's state is not as the tested release of Ray writes it.
     """
+    if args.storage is None and not take_up(args.results_dir, KEPT):
+        print("It was killed before it had begun: it is started anew.", flush=True)
+        return start(name, args, specs, search, callbacks)
     forget_decisions(args.results_dir)
     others = []
     if not search:
@@ -100,7 +121,7 @@ def resume(name: str, args: Namespace, specs: Sequence[TrialSpec], search: Searc
         search_alg=way,
         scheduler=_scheduler(search, specs),
         progress_reporter=_progress(args),
-        callbacks=[Retries(args.max_failures), *make_callbacks(name, args)],
+        callbacks=[*callbacks, Retries(args.max_failures), *make_callbacks(name, args)],
         raise_on_failed_trial=False,
         verbose=1,
     )
@@ -137,7 +158,7 @@ def _scheduler(search: Search | None, specs: Sequence[TrialSpec]) -> Any:
 
 
 def _checkpoints() -> tune.CheckpointConfig:
-    return tune.CheckpointConfig(checkpoint_at_end=True, num_to_keep=1)  # and whenever a trial asks for one
+    return tune.CheckpointConfig(checkpoint_at_end=True, num_to_keep=KEPT)  # and whenever a trial asks for one
 
 
 def _progress(args: Namespace) -> ProgressTable:
