@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import numbers
 import types
 from collections.abc import Callable, Hashable, Mapping
@@ -107,7 +108,10 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
     if hint is int:
         return isinstance(value, numbers.Integral), int(value) if isinstance(value, numbers.Integral) else value
     if hint is float:
-        finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
+        try:
+            finite = isinstance(value, numbers.Real) and math.isfinite(value)
+        except OverflowError:  # an integer that no float is as large as
+            finite = False
         return finite, float(value) if finite else value
     return hint is Any or not isinstance(hint, type) or isinstance(value, hint), value
 
