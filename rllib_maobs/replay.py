@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from numbers import Real
 from typing import Annotated, Any, NamedTuple
@@ -15,6 +14,7 @@ from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from torch import Tensor
 
+from rllib_maobs.memory import gigabytes, memory_of
 from rllib_maobs.options import Range, check_value
 
 _NONE = -1  # "no such row" in the links between rows
@@ -92,22 +92,8 @@ def _is_count(value: Any, low: int) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= low)
 
 
-def _gigabytes(count: int) -> str:
-    """A number of bytes, which may be larger than any float."""
-    return f"{count / 1e9:,.1f}" if count < 1e18 else f"more than {10**9:,}"
-
-
 def _is_shape(value: Any) -> bool:
     return isinstance(value, tuple | list) and all(_is_count(size, 1) for size in value)
-
-
-def memory_of(device: torch.device | str) -> float:
-    """Bytes of memory that there are for a device: of the GPU, or of the machine; infinity where nobody says."""
-    if torch.device(device).type == "cuda":
-        return float(torch.cuda.get_device_properties(device).total_memory)
-    if hasattr(os, "sysconf"):  # not on Windows
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return math.inf
 
 
 class JointReplayBuffer(Checkpointable):
@@ -189,8 +175,8 @@ class JointReplayBuffer(Checkpointable):
         self._row = row
         if capacity * row > (memory := memory_of(device)):
             raise ValueError(
-                f"A replay buffer of {capacity} rows takes {_gigabytes(capacity * row)} GB, {row} bytes for each joint "
-                f"step, and there are {memory / 1e9:,.1f} GB: legal is a capacity up to {int(memory // row)}."
+                f"A replay buffer of {capacity} rows takes {gigabytes(capacity * row)}, {row} bytes for each joint "
+                f"step, and there are {gigabytes(memory)}: legal is a capacity up to {int(memory) // row}."
             )
         # Empty memory is not touched, so it costs nothing until rows are written to it.
         self._columns = {
@@ -357,10 +343,11 @@ class JointReplayBuffer(Checkpointable):
         Raises:
             ValueError: If no complete transition is stored yet, or a length is not legal.
         """
-        if not (_is_count(n_step, 1) and _is_count(seq_length, 0) and isinstance(gamma, Real) and 0 <= gamma <= 1):
+        counts = _is_count(n_step, 1) and _is_count(seq_length, 0) and seq_length <= self.capacity
+        if not (counts and isinstance(gamma, Real) and 0 <= gamma <= 1):
             raise ValueError(
-                f"n_step must be an integer >= 1, seq_length one >= 0 and gamma a number from 0 to 1, not {n_step!r}, "
-                f"{seq_length!r} and {gamma!r}."
+                f"n_step must be an integer >= 1, seq_length one >= 0 that is no larger than the capacity "
+                f"({self.capacity}), and gamma a number from 0 to 1, not {n_step!r}, {seq_length!r} and {gamma!r}."
             )
         size = math.prod(shape) * max(1, seq_length) * self._row if _is_shape(shape) else math.inf
         if size > memory_of(self._columns["obs"].device):

@@ -399,5 +399,5 @@ def test_columns_of_another_team_and_illegal_lengths_are_refused() -> None:
             JointReplayBuffer(400, N, O, A).add(**columns | wrong)
     buffer.add(**columns)
     for wrong in ({"n_step": 0}, {"seq_length": -1}):
-        with pytest.raises(ValueError, match=r"n_step must be an integer >= 1, seq_length one >= 0 .*, not"):
+        with pytest.raises(ValueError, match=r"n_step must be an integer >= 1, seq_length one >= 0 .*, not "):
             buffer.sample((4,), gamma=G, **wrong)

@@ -24,11 +24,11 @@ from rllib_maobs.algorithms import settings
 from rllib_maobs.envs.team import Team, shares_reward
 from rllib_maobs.layout import Layout
 from rllib_maobs.learner import MIXER, JointLearner
+from rllib_maobs.memory import gigabytes, memory_of
 from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, EntityActor, EntityLSTMActor, RecurrentActor
 from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings, takes
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.options import closest
-from rllib_maobs.replay import memory_of
 from rllib_maobs.runner import JointEnvRunner, make_env
 
 if TYPE_CHECKING:
@@ -337,7 +337,7 @@ def check_machine(config: JointConfig) -> None:
     size = 8 * observations * len(team.agents) * team.observation_size  # now and next, in single precision
     if size > (memory := memory_of("cuda" if config.num_gpus_per_learner > 0 else "cpu")):
         raise ValueError(
-            f"A minibatch takes {size / 1e9:,.1f} GB, and there are {memory / 1e9:,.1f} GB: lower "
+            f"A minibatch takes {gigabytes(size)}, and there are {gigabytes(memory)}: lower "
             f"train_batch_size_per_learner ({config.train_batch_size_per_learner}) or seq_length "
             f"({config.seq_length}, with recurrent actors)."
         )

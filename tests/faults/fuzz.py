@@ -80,7 +80,7 @@ class Refused(Exception):
 
 
 class TooSlowError(BaseException):
-    """An input took longer than `SECONDS`."""
+    """An input took longer than `SECONDS`; nothing that is tried catches it."""
 
 
 def attempt(
@@ -109,6 +109,8 @@ def attempt(
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         return call()
+    except TooSlowError as error:
+        raise AssertionError(str(error)) from error
     except errors as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         sentence = str(error)
