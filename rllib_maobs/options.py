@@ -43,6 +43,14 @@ def closest(name: str, legal: list[str]) -> str:
     return f" (did you mean {match[0]!r}?)" if match else ""
 
 
+def as_list(value: Any) -> list[Any] | None:
+    """What a value lists; None if it lists nothing, like a number, or something else, like a text or a dict."""
+    try:
+        return None if isinstance(value, str | bytes | Mapping) else list(value)
+    except TypeError:
+        return None
+
+
 def build_options(cls: type[T], values: dict[str, Any], owner: str) -> T:
     """Build an options dataclass from keywords, after checking every name and value.
 

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "rllib_maobs"
 # What each part may import of the others; whatever is not listed may import nothing of them.
 FOUNDATION = {"layout", "memory", "options", "paths", "registry"}
 ALLOWED = {
-    "layout": set(),
+    "layout": {"options"},
     "memory": set(),
     "options": set(),
     "paths": set(),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from rllib_maobs.envs.checking import check_outcome, check_scenario, checked_places
 from rllib_maobs.envs.metrics import EpisodeTracker
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.layout import Layout, as_layout
@@ -57,6 +58,7 @@ class VectorEnv:
     def __init__(self, scenario: Scenario[Any], num_envs: int = 1) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} is illegal; legal: an integer >= 1")
+        check_scenario(scenario)
         self.scenario = scenario
         self.num_envs = int(num_envs)
         self.agents = list(scenario.agents)
@@ -84,7 +86,7 @@ class VectorEnv:
         self._actions_shape = (self.num_envs, n, *action_shape)
         self._discrete = scenario.options.action_mode == "discrete"
 
-        # What there is of every pair of a body that moves and any other: offset, distance, gap and room to compute them.
+        # Of every pair of a body that moves and any other there are offset, distance, gap, and room to compute them.
         bodies = scenario.bodies()
         pairs = sum(group.count for group in bodies if group.movable) * sum(group.count for group in bodies)
         if (size := 48 * self.num_envs * pairs) > memory_of("cpu"):
@@ -100,6 +102,7 @@ class VectorEnv:
         self._steps = np.zeros(self.num_envs, np.int64)
         # A copy that was never reset is treated like one that has finished: it must be reset.
         self._finished = np.ones(self.num_envs, bool)
+        self._checked = False
 
     def reset(
         self, seed: int | Sequence[int] | None = None, mask: NDArray[np.bool_] | None = None
@@ -118,7 +121,8 @@ class VectorEnv:
         self._seed(seeds, copies)
         assert self._rngs is not None
         if copies.size:
-            self.world.position[copies] = self.scenario.place([self._rngs[e] for e in copies.tolist()])
+            position = self.scenario.place([self._rngs[e] for e in copies.tolist()])
+            self.world.position[copies] = checked_places(self.scenario, position, copies.size, self.world.num_bodies)
             self.world.velocity[copies] = 0.0
             self._tracker.reset(copies)
             self._steps[copies] = 0
@@ -156,6 +160,9 @@ class VectorEnv:
         self._steps += 1
 
         outcome = scenario.outcome(world)
+        if not self._checked:  # all steps are alike
+            check_outcome(scenario, outcome, self.num_envs)
+            self._checked = True
         self._tracker.update(world, outcome)
         ends = outcome.success if scenario.options.terminate_on_success else np.zeros(self.num_envs, bool)
         terminated = np.array(ends, bool)
@@ -228,7 +235,7 @@ class VectorEnv:
     def _check_mask(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, bool)
-        mask = _as_array(mask, "mask")
+        mask = as_array(mask, "mask")
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"mask is {mask.dtype} of shape {mask.shape}; expected bool of shape ({self.num_envs},)")
         return mask
@@ -237,7 +244,7 @@ class VectorEnv:
         """Return the (E,) seeds that are meant; None for none."""
         if seed is None:
             return None
-        seeds = _as_array(seed, "seed")
+        seeds = as_array(seed, "seed")
         if seeds.shape == () and seeds.dtype.kind in "iu":
             seeds = seeds + np.arange(self.num_envs)
         if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
@@ -275,7 +282,7 @@ class VectorEnv:
         )
 
     def _check_actions(self, joint: NDArray[Any]) -> NDArray[Any]:
-        actions = _as_array(joint, "actions")
+        actions = as_array(joint, "actions")
         if actions.shape != self._actions_shape:
             letters = "(E, N)" if self._discrete else "(E, N, A)"
             raise ValueError(f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}")
@@ -296,8 +303,9 @@ class VectorEnv:
             raise ValueError(f"action of {self.agents[agent]} in copy {copy} is {reason}: {actions[copy, agent]}")
 
 
-def _as_array(values: Any, name: str) -> NDArray[Any]:
+def as_array(values: Any, name: str) -> NDArray[Any]:
+    """Return an array of what was given under a name; raise a ValueError that has the name if there is none."""
     try:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:  # such as rows of different lengths
-        raise ValueError(f"{name} {'are' if name == 'actions' else 'is'} no array: {error}") from None
+        raise ValueError(f"{name} {'are' if name.endswith('s') else 'is'} no array: {error}") from None

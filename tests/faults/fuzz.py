@@ -97,7 +97,7 @@ def attempt(
         tally: Where it is counted.
         errors: What is documented.
         sources: Whose errors these are: the innermost frame of the traceback must be in a file that begins so. An error
-            that NumPy or Python raised by itself says nothing about what the user did.
+            that NumPy or Python raised by itself, where no `raise` stands, says nothing about what the user did.
     """
     if tally is not None:
         tally["inputs tried"] += 1
@@ -115,6 +115,7 @@ def attempt(
         where = traceback.extract_tb(error.__traceback__)[-1]
         sentence = str(error)
         assert where.filename.startswith(sources), f"{type(error).__name__} of {where}: {sentence[:300]}"
+        assert (where.line or "").startswith("raise "), f"{type(error).__name__} of {where}: {sentence[:300]}"
         assert len(sentence) >= 20 and " " in sentence, f"no sentence: {sentence!r}"
         assert len(sentence) < 5_000, f"{len(sentence)} characters: {sentence[:300]}"
         raise Refused(sentence) from error
