@@ -13,6 +13,7 @@ from ray.rllib.core.rl_module import RLModule
 from rllib_maobs.algorithms import JointAlgorithm, JointConfig
 from rllib_maobs.algorithms.checks import built_modules
 from rllib_maobs.learner.networks import MIXER
+from rllib_maobs.paths import local
 
 logger = logging.getLogger(__name__)
 _MODULES = ("learner_group", "learner", "rl_module")
@@ -29,7 +30,7 @@ def find_checkpoint(path: str | Path) -> Path:
     """
     if not str(path):  # which would be the present folder
         raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
-    folder = Path(path).expanduser().resolve()
+    folder = local(path).resolve()
     for found in (folder, *sorted(folder.glob("checkpoint_*"), reverse=True)):
         if found.joinpath(*_MODULES).is_dir():
             return found

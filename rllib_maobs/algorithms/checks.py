@@ -340,7 +340,7 @@ def _is_wide(settings: Any) -> bool:
         settings = [*settings.values()]
     if isinstance(settings, list | tuple):
         return any(map(_is_wide, settings))
-    return isinstance(settings, int | np.integer) and settings > 2048
+    return isinstance(settings, int | np.integer) and bool(settings > 2048)
 
 
 def _check_size(specs: Mapping[str, RLModuleSpec]) -> None:

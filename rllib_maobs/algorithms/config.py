@@ -67,13 +67,15 @@ def _checked(method: MethodT) -> MethodT:
 
 @contextmanager
 def _as_before_if_refused(config: JointConfig) -> Iterator[None]:
-    """Takes back what was set where one of the settings is refused."""
+    """Takes back what was set where one of the settings is refused, and makes every refusal a ValueError."""
     before = {name: dict(value) if type(value) is dict else value for name, value in vars(config).items()}
     try:
         yield
-    except Exception:
-        vars(config).clear()
-        vars(config).update(before)
+    except Exception as error:
+        config.__dict__.clear()
+        config.__dict__.update(before)
+        if isinstance(error, AssertionError | TypeError | LookupError):  # how RLlib refuses some values
+            raise ValueError(f"RLlib can't take these settings of {type(config).__name__}: {error!r}.") from error
         raise
 
 
@@ -270,6 +272,8 @@ class JointConfig(AlgorithmConfig):
         """Changes settings, e.g. by Tune's `param_space`, whichever of their names in RLlib they are given by."""
         if not isinstance(config_dict, Mapping) or not all(isinstance(name, str) for name in config_dict):
             raise ValueError(f"A configuration is changed by a dict of settings by name, not {config_dict!r}.")
+        for name in config_dict:
+            settings.check_is_no_part(self, name)
         with _as_before_if_refused(self):
             super().update_from_dict(settings.as_attributes(config_dict))
         return self

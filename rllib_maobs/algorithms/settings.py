@@ -480,6 +480,14 @@ def check_schedule(name: str, rate: Any) -> None:
         )
 
 
+def check_is_no_part(config: JointConfig, name: str) -> None:
+    """Raises a ValueError for the name of what a configuration does or is, and not of a setting."""
+    if name in dir(object) or callable(getattr(type(config), name, None)):
+        raise ValueError(
+            f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
+        )
+
+
 def check_known(config: JointConfig) -> None:
     """Checks that there is no setting that nobody knows, and none that would do nothing.
 
@@ -490,10 +498,7 @@ def check_known(config: JointConfig) -> None:
     for name in vars(config):
         if name in defaults or name in _FILLED_IN or name.startswith("__"):  # Tune's own begin so
             continue
-        if callable(getattr(type(config), name, None)):
-            raise ValueError(
-                f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
-            )
+        check_is_no_part(config, name)
         raise ValueError(unknown(config, name))
     refused = {attribute_of(name): (name, why) for name, why in REFUSED.items()}
     for name, value, default in changed(config):
