@@ -13,6 +13,7 @@ from ray.rllib.core.rl_module import RLModule
 from rllib_maobs.algorithms import JointAlgorithm, JointConfig
 from rllib_maobs.algorithms.checks import built_modules
 from rllib_maobs.learner.networks import MIXER
+from rllib_maobs.paths import local
 from rllib_maobs.whole import METADATA, first_whole, numbered, with_those_before
 
 logger = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ def find_checkpoint(path: str | Path) -> Path:
     """
     if not str(path):  # which would be the present folder
         raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
-    folder = Path(path).expanduser().resolve()
+    folder = local(path).resolve()
     candidates = with_those_before(folder) if (folder / METADATA).exists() else numbered(folder)
     if candidates and (found := first_whole(*candidates)).joinpath(*_MODULES).is_dir():
         return found

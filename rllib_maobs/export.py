@@ -30,12 +30,24 @@ from ray.rllib.core.rl_module import RLModule
 
 from rllib_maobs.checkpoints import find_checkpoint, module_folders, saved_config
 from rllib_maobs.envs import SCENARIOS
-from rllib_maobs.exported import CLASSES, FORMATS, KEY, SETTINGS, VERSION, ActorDescription, Description, OnnxActor
+from rllib_maobs.exported import (
+    CHECKSUM,
+    CLASSES,
+    FORMATS,
+    KEY,
+    SETTINGS,
+    UNSEALED,
+    VERSION,
+    ActorDescription,
+    Description,
+    OnnxActor,
+    sealed,
+)
 from rllib_maobs.layout import Layout, layout_size
 from rllib_maobs.modules import ACTORS, AgentModule
 from rllib_maobs.modules.portable import PortableActor, PortableTeam
 from rllib_maobs.options import closest
-from rllib_maobs.paths import file_name, write_aside
+from rllib_maobs.paths import file_name, local, write_aside
 from rllib_maobs.policies import trained_on
 
 NEEDED = {".onnx": ("onnx", "onnxscript", "onnxruntime"), ".safetensors": ("safetensors",)}
@@ -93,7 +105,7 @@ def export_agents(
             exported.
         ImportError: If what writes such a file is not installed.
     """
-    path = Path(path).expanduser()
+    path = local(path)
     ending = path.suffix.lower()
     if ending not in FORMATS:
         raise ValueError(f"{str(path)!r} is no file to export to; legal are names that end in {' or '.join(FORMATS)}")
@@ -223,7 +235,7 @@ def _safetensors(source: Mapping[str, _Exported], description: Description) -> b
         for name, actor in source.items()
         for key, value in actor.module.get_state(inference_only=True).items()
     }
-    return bytes(save(tensors, {KEY: description.to_json()}))
+    return sealed(bytes(save(tensors, {KEY: description.to_json(), CHECKSUM: UNSEALED})))
 
 
 def _onnx(source: Mapping[str, _Exported], description: Description) -> bytes:
@@ -269,12 +281,13 @@ def _onnx(source: Mapping[str, _Exported], description: Description) -> bytes:
     assert program is not None
     _tidy(program.model)
     model = program.model_proto
-    entry = model.metadata_props.add()
-    entry.key, entry.value = KEY, description.to_json()
+    for key, value in {KEY: description.to_json(), CHECKSUM: UNSEALED}.items():
+        entry = model.metadata_props.add()
+        entry.key, entry.value = key, value
     # The tracer's notes name files of this machine.
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output, model.graph):
         del part.metadata_props[:]
-    content: bytes = model.SerializeToString()
+    content = sealed(model.SerializeToString())
     _check(content, source, description)
     return content
 

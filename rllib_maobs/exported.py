@@ -6,6 +6,8 @@ Both hold the same description under the key "rllib_maobs" of their metadata, as
 from __future__ import annotations
 
 import json
+import re
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -19,9 +21,13 @@ from numpy.typing import NDArray
 
 from rllib_maobs.layout import Layout, as_layout, layout_size, split
 from rllib_maobs.modules import ACTORS, Actor, AgentModule, UtilityModule
+from rllib_maobs.paths import local
 
 FORMATS = (".onnx", ".safetensors")
 KEY = "rllib_maobs"
+CHECKSUM = "rllib_maobs_crc32"
+UNSEALED = "00000000"  # what stands in the place of the checksum that is being computed
+_SEAL = re.compile(CHECKSUM.encode() + rb"\W{1,8}([0-9a-f]{8})")
 VERSION = 1
 CLASSES = {"AgentModule": AgentModule, "UtilityModule": UtilityModule}
 # What of a module's settings a file may set: acting needs no others, and no other is looked at.
@@ -117,6 +123,23 @@ class Description:
         return shared[0] if shared else agent
 
 
+def sealed(content: bytes) -> bytes:
+    """A file with its checksum under the key `CHECKSUM` of its metadata, where `UNSEALED` stood before."""
+    place = _SEAL.search(content)
+    assert place is not None
+    return content[: place.start(1)] + b"%08x" % zlib.crc32(content) + content[place.end(1) :]
+
+
+def _check_whole(path: Path, content: bytes) -> None:
+    """Raise a ValueError for a file that is not as it was written; those without a checksum are not checked."""
+    place = _SEAL.search(content)
+    if place is None:
+        return
+    unsealed = content[: place.start(1)] + UNSEALED.encode() + content[place.end(1) :]
+    if zlib.crc32(unsealed) != int(place.group(1), 16):
+        raise ValueError(f"{str(path)!r} is damaged: it is not as it was written, says its checksum")
+
+
 def is_exported(path: str | Path) -> bool:
     """Whether a path names an exported file, by its ending."""
     return Path(path).suffix.lower() in FORMATS
@@ -145,13 +168,13 @@ def load_agent(path: str | Path, agent: str | None = None, actor: type[Actor] | 
         ValueError: If that is no such file, it has no such agent, or its weights do not fit.
         ImportError: If safetensors is not installed.
     """
-    if Path(path).suffix.lower() != ".safetensors":
+    if local(path).suffix.lower() != ".safetensors":
         raise ValueError(f"{str(path)!r} can't be made an RLModule; legal: a .safetensors file.")
     description, modules = read_exported(path, actor)
     agents = [name for each in description.actors.values() for name in each.agents]
     if agent is None and len(modules) > 1:
         raise ValueError(f"{str(path)!r} holds several agents: say which, agent= one of {', '.join(agents)}.")
-    if agent is not None and agent not in agents:
+    if agent is not None and not (isinstance(agent, str) and agent in agents):
         raise ValueError(f"{str(path)!r} has no agent {agent!r}; it has {', '.join(agents)}.")
     module = modules[next(iter(modules)) if agent is None else description.actor_of(agent)]
     assert isinstance(module, AgentModule)
@@ -165,7 +188,7 @@ def describe(path: str | Path) -> Description:
         ValueError: If it says nothing, or nothing that can be understood.
         ImportError: If what reads it is not installed.
     """
-    return _parsed(Path(path), _opened(Path(path))[0])
+    return _parsed(local(path), _opened(local(path))[0])
 
 
 def read_exported(
@@ -184,14 +207,14 @@ def read_exported(
         ValueError: If it is damaged, or not one of this package.
         ImportError: If what reads it is not installed.
     """
-    path = Path(path)
+    path = local(path)
     metadata, content = _opened(path)
     description = _parsed(path, metadata)
     try:
         if path.suffix.lower() == ".onnx":
             return description, {name: OnnxActor(content, description, name) for name in description.actors}
         return description, {name: _module(description, name, content, actor) for name in description.actors}
-    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
+    except Exception as error:  # whatever networks say to settings that are a stranger's
         raise ValueError(f"{str(path)!r} can't be read: {error}") from error
 
 
@@ -273,6 +296,8 @@ def _opened(path: Path) -> tuple[Mapping[str, str], Any]:
     """A file's metadata, and its content: an ONNX Runtime session, or tensors by name."""
     if not path.is_file():
         raise ValueError(f"there is no file {str(path)!r}")
+    content = path.read_bytes()
+    _check_whole(path, content)
     if path.suffix.lower() == ".onnx":
         runtime = _needed("onnxruntime")
         options = runtime.SessionOptions()
@@ -280,10 +305,10 @@ def _opened(path: Path) -> tuple[Mapping[str, str], Any]:
         options.log_severity_level = 4  # what is wrong is said by the error
         try:
             # From bytes, so that the file cannot refer to others.
-            session = runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            return session.get_modelmeta().custom_metadata_map, session
         except Exception as error:  # ONNX Runtime's own classes
             raise ValueError(f"{str(path)!r} is no ONNX file that can be read: {error}") from error
-        return session.get_modelmeta().custom_metadata_map, session
     safetensors = _needed("safetensors")
     try:
         with safetensors.safe_open(path, "pt") as file:

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from numbers import Integral
 from typing import Any, NamedTuple, TypeVar
 
+from rllib_maobs.options import as_list
+
 ArrayT = TypeVar("ArrayT", bound=Any)
 
 
@@ -76,10 +78,10 @@ def as_layout(groups: Iterable[Iterable[Any]], size: int | None, owner: str) -> 
     Raises:
         ValueError: If a value is not legal, a name is there twice, or the lengths do not add up.
     """
-    if not isinstance(groups, Iterable) or isinstance(groups, str):
+    if (listed := as_list(groups)) is None:
         raise ValueError(f"The layout of the {owner} is {groups!r}; legal is a list of groups (name, count, size).")
     layout = []
-    for group in groups:
+    for group in listed:
         try:
             entities = Entities(*group)
         except TypeError:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import numbers
 import types
 from collections.abc import Callable, Hashable, Mapping
@@ -40,6 +41,14 @@ def closest(name: str, legal: list[str]) -> str:
     """Return " (did you mean ...?)" for a misspelt name, or an empty string."""
     match = difflib.get_close_matches(name, legal, n=1, cutoff=0.5)
     return f" (did you mean {match[0]!r}?)" if match else ""
+
+
+def as_list(value: Any) -> list[Any] | None:
+    """What a value lists; None if it lists nothing, like a number, or something else, like a text or a dict."""
+    try:
+        return None if isinstance(value, str | bytes | Mapping) else list(value)
+    except TypeError:
+        return None
 
 
 def build_options(cls: type[T], values: dict[str, Any], owner: str) -> T:
@@ -107,7 +116,10 @@ def _accept(value: Any, hint: Any) -> tuple[bool, Any]:
     if hint is int:
         return isinstance(value, numbers.Integral), int(value) if isinstance(value, numbers.Integral) else value
     if hint is float:
-        finite = isinstance(value, numbers.Real) and bool(np.isfinite(float(value)))
+        try:
+            finite = isinstance(value, numbers.Real) and math.isfinite(value)
+        except OverflowError:  # an integer that no float is as large as
+            finite = False
         return finite, float(value) if finite else value
     return hint is Any or not isinstance(hint, type) or isinstance(value, hint), value
 

@@ -45,6 +45,21 @@ def _local(path: Any, given: dict[str, Any]) -> Any:
     return path if given.get("filesystem") else absolute(path)
 
 
+def local(path: Any) -> Path:
+    """A path of this machine, as people write it.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        found = Path(path).expanduser()
+        os.fsencode(found)
+        found.exists()
+    except (TypeError, ValueError, OSError, RuntimeError) as error:  # such as NUL, a name too long, an unknown ~user
+        raise ValueError(f"{path!r} is no path of a file or folder: {error}") from None
+    return found
+
+
 def file_name(name: str) -> str:
     """A file's name made of one from outside, such as an agent's: it names no other folder, and no hidden file."""
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[:100] or "_"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
+from numbers import Real
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from ray.rllib.utils.annotations import override
 from ray.rllib.utils.checkpoints import Checkpointable
 from torch import Tensor
 
+from rllib_maobs.memory import gigabytes, memory_of
 from rllib_maobs.options import Range, check_value
 
 _NONE = -1  # "no such row" in the links between rows
@@ -87,13 +88,12 @@ def _unbound(part: Any) -> Any:
     return [type(part)(*(c[i] if isinstance(c, list) else c for c in columns)) for i in range(count)]
 
 
-def memory_of(device: torch.device | str) -> float:
-    """Bytes of memory that there are for a device: of the GPU, or of the machine; infinity where nobody says."""
-    if torch.device(device).type == "cuda":
-        return float(torch.cuda.get_device_properties(device).total_memory)
-    if hasattr(os, "sysconf"):  # not on Windows
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return math.inf
+def _is_count(value: Any, low: int) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= low)
+
+
+def _is_shape(value: Any) -> bool:
+    return isinstance(value, tuple | list) and all(_is_count(size, 1) for size in value)
 
 
 class JointReplayBuffer(Checkpointable):
@@ -134,14 +134,24 @@ class JointReplayBuffer(Checkpointable):
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        for name, size, low in (
-            ("capacity", capacity, 1),
-            ("num_agents", num_agents, 1),
-            ("observation_size", observation_size, 1),
-            ("action_size", action_size, 1),
-            ("state_size", state_size, 0),
-        ):
-            check_value(size, Annotated[int, Range(low)], name, type(self).__name__)
+        positive, natural = Annotated[int, Range(1)], Annotated[int, Range(0)]
+        (capacity, num_agents, observation_size, action_size, state_size, seed) = (
+            check_value(value, legal, name, type(self).__name__)
+            for name, value, legal in (
+                ("capacity", capacity, positive),
+                ("num_agents", num_agents, positive),
+                ("observation_size", observation_size, positive),
+                ("action_size", action_size, positive),
+                ("state_size", state_size, natural),
+                ("seed", seed, natural | None),
+            )
+        )
+        if recurrent_state is not None and not _is_shape(recurrent_state):
+            raise ValueError(f"recurrent_state must be None or a shape such as (2, 64), not {recurrent_state!r}.")
+        try:
+            device = torch.device(device)
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(f"device must be one of PyTorch's, such as 'cpu' or 'cuda', not {device!r}.") from error
         self.capacity = capacity
         self._arguments: dict[str, Any] = {
             "capacity": capacity,
@@ -162,10 +172,11 @@ class JointReplayBuffer(Checkpointable):
         if recurrent_state is not None:
             shapes["recurrent_state"] = (num_agents, *recurrent_state)
         row = 16 + sum(math.prod(shape) * (1 if name == "terminated" else 4) for name, shape in shapes.items())
+        self._row = row
         if capacity * row > (memory := memory_of(device)):
             raise ValueError(
-                f"A replay buffer of {capacity} rows takes {capacity * row / 1e9:,.1f} GB, {row} bytes for each joint "
-                f"step, and there are {memory / 1e9:,.1f} GB: legal is a capacity up to {int(memory // row)}."
+                f"A replay buffer of {capacity} rows takes {gigabytes(capacity * row)}, {row} bytes for each joint "
+                f"step, and there are {gigabytes(memory)}: legal is a capacity up to {int(memory) // row}."
             )
         # Empty memory is not touched, so it costs nothing until rows are written to it.
         self._columns = {
@@ -230,12 +241,14 @@ class JointReplayBuffer(Checkpointable):
             failed: Where the environment failed instead of stepping, `(L, E)`: the episode breaks off with that step's
                 observation, and another one follows. None if it nowhere did.
         """
-        length, copies = truncated.shape
-        if terminated.shape != (length, copies, self._arguments["num_agents"]):
-            raise ValueError(
-                f"'terminated' must be an array {(length, copies, self._arguments['num_agents'])}, as 'truncated' is "
-                f"one of {truncated.shape}, not {terminated.shape}."
-            )
+        legal = isinstance(truncated, np.ndarray) and truncated.dtype == np.bool_
+        if not legal or truncated.ndim != 2 or truncated.size == 0:
+            there = f"{truncated.dtype} {truncated.shape}" if isinstance(truncated, np.ndarray) else repr(truncated)
+            raise ValueError(f"'truncated' must be an array (L, E) of bools, L and E at least 1, not {there}.")
+        if not isinstance(source, str) or not _is_count(start, 0):
+            raise ValueError(f"source must be a string and start an integer >= 0, not {source!r} and {start!r}.")
+        length, copies = rows = truncated.shape
+        terminated = self._checked("terminated", terminated, rows)
         done = terminated.all(-1) | truncated
         steps = length * copies
         row = self._head + np.arange(steps).reshape(length, copies)
@@ -245,6 +258,22 @@ class JointReplayBuffer(Checkpointable):
                 f"{steps} steps and {last.size} final observations at once do not fit into a replay buffer of "
                 f"{self.capacity} rows: raise replay_buffer_capacity or lower rollout_fragment_length."
             )
+        # All is checked before anything is changed.
+        columns: dict[str, NDArray[Any]] = {"terminated": terminated}
+        finals: dict[str, NDArray[Any]] = {}
+        for name, now, final in (
+            ("obs", obs, final_obs),
+            ("actions", actions, None),
+            ("rewards", rewards, None),
+            ("state", state, final_state),
+            ("recurrent_state", recurrent_state, final_recurrent_state),
+        ):
+            if name in self._columns:
+                columns[name] = self._checked(name, now, rows)
+                if final is not None or (last.size and name not in ("actions", "rewards")):
+                    finals[name] = self._checked(name, final, last.shape)
+            elif now is not None:
+                raise ValueError(f"{name!r} was given, but this replay buffer stores none.")
         # Links: the step after it, the final observation where the episode ended, open at the fragment's end.
         following = np.full((length, copies), _NONE, dtype=np.int64)
         following[:-1] = row[1:]
@@ -260,32 +289,41 @@ class JointReplayBuffer(Checkpointable):
         last_kept = self._head + steps + last.size - self.capacity
         for copy in range(copies):
             tail, position = self._tails.get((source, copy), (_NONE, 0))
-            alive = tail != _NONE and tail >= last_kept
-            if alive and position == start:
-                self._next[tail % self.capacity] = row[0, copy]
-                previous[0, copy] = tail
+            if tail != _NONE and position == start:
+                previous[0, copy] = tail  # also where it is overwritten: windows that reach that far are cut
+                if tail >= last_kept:
+                    self._next[tail % self.capacity] = row[0, copy]
             self._tails[source, copy] = (_NONE if over[-1, copy] else row[-1, copy], start + length)
         self._next[row % self.capacity] = following
         self._next[last % self.capacity] = _NONE
         self._previous[row % self.capacity] = previous
         self._previous[last % self.capacity] = row[done]
-
-        rows, ends = (length, copies), (last.size,)
-        self._write(row.reshape(-1), rows, obs=obs, actions=actions, rewards=rewards, terminated=terminated)
-        self._write(last, ends, obs=final_obs)
-        for name, now, final in (
-            ("state", state, final_state),
-            ("recurrent_state", recurrent_state, final_recurrent_state),
-        ):
-            if name in self._columns:
-                self._write(row.reshape(-1), rows, **{name: now})
-                self._write(last, ends, **{name: final})
-            elif now is not None:
-                raise ValueError(f"{name!r} was given, but this replay buffer stores none.")
+        self._write(row.reshape(-1), columns)
+        self._write(last, finals)
         self._head += steps + last.size
 
-    def _write(self, rows: NDArray[np.int64], leading: tuple[int, ...], **columns: NDArray[Any] | None) -> None:
-        """Writes arrays `(*leading, ...)` to rows that follow one another."""
+    def _checked(self, name: str, values: Any, leading: tuple[int, ...]) -> NDArray[Any]:
+        """Values of a column `(*leading, ...)` as they are stored.
+
+        Raises:
+            ValueError: If there are none, or they are no numbers, or have another shape.
+        """
+        expected = leading + self._shapes[name]
+        what = name if len(leading) == 2 else f"final_{name}"
+        if values is None:
+            raise ValueError(f"The replay buffer stores {what!r}, but none was given.")
+        if getattr(values, "shape", None) != expected:
+            there = getattr(values, "shape", f"a {type(values).__name__}")
+            hint = f", as 'truncated' is one of {leading}" if name == "terminated" else ""
+            raise ValueError(f"{what!r} must be an array {expected}{hint}, not {there}.")
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in ("b" if name == "terminated" else "fiub"):
+            legal = "bools" if name == "terminated" else "numbers"
+            raise ValueError(f"{what!r} must be a NumPy array of {legal}, not of {getattr(values, 'dtype', 'others')}.")
+        # Arrays from a remote runner are read-only, which torch warns of.
+        return np.require(values, np.bool_ if name == "terminated" else np.float32, ["C", "W"])
+
+    def _write(self, rows: NDArray[np.int64], columns: dict[str, NDArray[Any]]) -> None:
+        """Writes to rows that follow one another."""
         if rows.size == 0:
             return
         # Rows are consecutive: one or two slices instead of an index.
@@ -293,14 +331,7 @@ class JointReplayBuffer(Checkpointable):
         split = min(rows.size, self.capacity - first)
         for name, values in columns.items():
             column = self._columns[name]
-            if values is None:
-                raise ValueError(f"The replay buffer stores {name!r}, but none was given.")
-            if getattr(values, "shape", None) != (expected := leading + self._shapes[name]):
-                what = name if len(leading) == 2 else f"final_{name}"
-                raise ValueError(f"{what!r} must be an array {expected}, not {np.shape(values)}.")
-            # np.require: arrays from a remote runner are read-only, which torch warns of.
-            dtype = np.bool_ if column.dtype == torch.bool else np.float32
-            flat = torch.from_numpy(np.require(values, dtype, "W")).reshape(rows.size, *column.shape[1:])
+            flat = torch.from_numpy(values).reshape(rows.size, *column.shape[1:])
             column[first : first + split] = flat[:split]
             column[: rows.size - split] = flat[split:]
 
@@ -321,9 +352,16 @@ class JointReplayBuffer(Checkpointable):
         Raises:
             ValueError: If no complete transition is stored yet, or a length is not legal.
         """
-        if n_step < 1 or seq_length < 0:
-            raise ValueError(f"n_step must be >= 1 and seq_length >= 0, not {n_step} and {seq_length}.")
-        rows = self._draw(int(np.prod(shape)), seq_length)
+        counts = _is_count(n_step, 1) and _is_count(seq_length, 0) and seq_length <= self.capacity
+        if not (counts and isinstance(gamma, Real) and 0 <= gamma <= 1):
+            raise ValueError(
+                f"n_step must be an integer >= 1, seq_length one >= 0 that is no larger than the capacity "
+                f"({self.capacity}), and gamma a number from 0 to 1, not {n_step!r}, {seq_length!r} and {gamma!r}."
+            )
+        size = math.prod(shape) * max(1, seq_length) * self._row if _is_shape(shape) else math.inf
+        if size > memory_of(self._columns["obs"].device):
+            raise ValueError(f"shape must be integers >= 1 whose samples fit into memory, not {shape!r}.")
+        rows = self._draw(math.prod(shape), seq_length)
         rewards = self._columns["rewards"]
         last, steps = rows, np.ones(rows.size)
         total = rewards.index_select(0, self._places(rows))
@@ -435,19 +473,36 @@ class JointReplayBuffer(Checkpointable):
         """Goes on from a saved state.
 
         Raises:
-            ValueError: If the state is of a buffer with another capacity or team.
+            ValueError: If the state is of a buffer with another capacity or team, or damaged; nothing has changed then.
         """
         saved = {name: state.get(name) for name in self._arguments}
-        if saved != self._arguments:
+        try:
+            fits = bool(saved == self._arguments)
+        except ValueError:  # an array in the place of a number
+            fits = False
+        if not fits:
             raise ValueError(f"The saved replay buffer is {saved}, this one {self._arguments}.")
-        self._head = state["head"]
+        try:
+            head, tails, generator = int(state["head"]), dict(state["tails"]), np.random.default_rng()
+            generator.bit_generator.state = state["rng"]
+            held = min(head, self.capacity)
+            columns = {name: torch.from_numpy(state["columns"][name]) for name in self._columns}
+            legal = all(len(column) == held for column in columns.values())
+            # One flag of all agents is that of each.
+            columns = {name: column.expand(held, *self._shapes[name]) for name, column in columns.items()}
+            links = state["next"], state["previous"]
+            legal &= all(link.shape == (held,) and link.dtype == np.int64 for link in links) and head >= 0
+            legal &= all(_is_count(place, _NONE) and _is_count(start, 0) for place, start in tails.values())
+            legal &= all((_NONE <= link).all() and (link < head).all() for link in links)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+            raise ValueError(f"The saved replay buffer is damaged ({type(error).__name__}: {error}).") from error
+        if not legal:
+            raise ValueError("The saved replay buffer is damaged: its columns and links do not belong together.")
+        self._head, self._tails, self._rng = head, tails, generator
         for name, column in self._columns.items():
-            column[: len(self)] = torch.from_numpy(state["columns"][name])
+            column[:held] = columns[name]
         self._next[:] = self._previous[:] = _NONE
-        self._next[: len(self)] = state["next"]
-        self._previous[: len(self)] = state["previous"]
-        self._tails = dict(state["tails"])
-        self._rng.bit_generator.state = state["rng"]
+        self._next[:held], self._previous[:held] = links
 
     @override(Checkpointable)
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:

@@ -267,7 +267,7 @@ class PictureAgents(TwoAgents):
         (lambda c: c.multi_agent(policies_to_train=["agent_0"]), r"policies_to_train must be None"),
         (
             lambda c: c.environment("maobs/spread-4a"),
-            r"Unknown environment 'maobs/spread-4a'; legal are maobs/.*, maobs/spread-3a",
+            r"Unknown environment 'maobs/spread-4a' \(did you mean 'maobs/spread-9a'\?\); legal are maobs/",
         ),
         (lambda c: c.environment(None), r"No environment: set one with"),
         (lambda c: c.environment(env_config={"num_agnts": 4}), r"num_agnts.*num_agents"),

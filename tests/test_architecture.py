@@ -7,16 +7,17 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "rllib_maobs"
 # What each part may import of the others; whatever is not listed may import nothing of them.
-FOUNDATION = {"layout", "options", "paths", "registry"}
+FOUNDATION = {"layout", "memory", "options", "paths", "registry"}
 ALLOWED = {
-    "layout": set(),
+    "layout": {"options"},
+    "memory": set(),
     "options": set(),
     "paths": set(),
     "registry": {"options"},
     "whole": set(),
     "envs": FOUNDATION,
     "modules": FOUNDATION,
-    "replay": {"options"},
+    "replay": {"memory", "options"},
     "runner": {*FOUNDATION, "envs", "modules"},
     "learner": {*FOUNDATION, "modules", "replay"},
     "algorithms": {*FOUNDATION, "envs", "modules", "replay", "runner", "learner", "whole"},

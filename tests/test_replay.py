@@ -141,6 +141,21 @@ def test_old_rows_give_way_and_what_is_left_stays_true(capacity: int) -> None:
     assert len(buffer) == capacity
 
 
+def test_what_follows_an_overwritten_step_is_no_episodes_start() -> None:
+    """A runner that was slow: by the time it goes on, others have overwritten its last step."""
+    buffer = JointReplayBuffer(20, N, O, A, seed=0)
+    slow, fast = Simulator(1, "slow", length=50), Simulator(1, "fast", length=50)
+    buffer.add(**slow.fragment(5))
+    buffer.add(**fast.fragment(12))
+    buffer.add(**fast.fragment(8))
+    slow.episode += 1  # to tell them apart; it is the same episode
+    buffer.add(**slow.fragment(8))
+    batch = drawn(buffer, (500,), gamma=G, seq_length=3)
+    code = batch["obs"][:, 0, 0].round().long()
+    assert {105, 106} & {*code.tolist()} == set() and {107, 108} <= {*code.tolist()}
+    assert (batch["mask"][code > 100] == 1).all()
+
+
 def test_a_fragment_that_fills_the_ring_leaves_no_link_to_what_it_replaced() -> None:
     buffer = JointReplayBuffer(8, N, O, A, seed=0)
     simulator = Simulator(2, length=50)
@@ -384,5 +399,5 @@ def test_columns_of_another_team_and_illegal_lengths_are_refused() -> None:
             JointReplayBuffer(400, N, O, A).add(**columns | wrong)
     buffer.add(**columns)
     for wrong in ({"n_step": 0}, {"seq_length": -1}):
-        with pytest.raises(ValueError, match=r"n_step must be >= 1 and seq_length >= 0, not"):
+        with pytest.raises(ValueError, match=r"n_step must be an integer >= 1, seq_length one >= 0 .*, not "):
             buffer.sample((4,), gamma=G, **wrong)

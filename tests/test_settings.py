@@ -141,7 +141,12 @@ def named(*agents: str) -> Any:
         (
             "maddpg",
             lambda c: c.training(n_step=10**6),
-            r"^n_step \(1000000\) must not be larger than replay_buffer_cap",
+            r"n_step=1000000 is illegal; legal: an integer >= 1 and <= 1000",
+        ),
+        (
+            "maddpg",
+            lambda c: c.training(n_step=101, replay_buffer_capacity=100, train_batch_size_per_learner=10),
+            r"^n_step \(101\) must not be larger than replay_buffer_cap",
         ),
         (
             "maddpg",
@@ -172,7 +177,23 @@ def named(*agents: str) -> Any:
         (
             "maddpg",
             lambda c: c.environment(object),
-            r"^object can't be called with env_config \(.*\): legal is a class whose constructor takes it",
+            r"^Unknown environment <class 'object'>; legal are maobs/.*, or an environment class",
+        ),
+        (
+            "maddpg",
+            lambda c: c.environment(type("NoConfig", (TwoAgents,), {"__init__": lambda self: None})),
+            r"^NoConfig can't be called with env_config \(.*\): legal is a class whose constructor takes it",
+        ),
+        ("maddpg", lambda c: c.environment("maobs/spread9a"), r"spread9a' \(did you mean 'maobs/spread-9a'\?\); legal"),
+        (
+            "maddpg",
+            lambda c: c.rl_module(model_config={"hidden_sizes": (60_000, 60_000)}),
+            r"^The networks take .* GB while they learn, and there are .* GB: make them smaller",
+        ),
+        (
+            "maddpg",
+            lambda c: c.rl_module(model_config={"hidden_sizes": (10**9,)}),
+            r"must be positive integers, .*: up to 65536 units in up to 100 layers",
         ),
         ("maddpg", lambda c: c.training(double_q=True), r"has no setting 'double_q'; it is one of iql, vdn, qmix\.$"),
         ("qmix", lambda c: c.training(critic_source="own"), r"QMIXConfig has no setting 'critic_source'; .* facmac\.$"),

@@ -22,11 +22,16 @@ PREY = "obstacle-predator-prey"
         ({"num_agents": True}, r"num_agents=True is illegal"),
         ({"agent_radius": 0.0}, r"agent_radius=0.0 is illegal; legal: a number > 0"),
         ({"accel": float("nan")}, r"accel=nan is illegal"),
-        ({"max_speed": -1}, r"max_speed=-1 is illegal; legal: a number > 0 or None"),
+        ({"max_speed": -1}, r"max_speed=-1 is illegal; legal: a number > 0 and <= 1e\+06 or None"),
         ({"reward_mode": "total"}, r"reward_mode='total' is illegal; legal: 'sum', 'mean', 'individual'"),
         ({"reward_mode": ["sum"]}, r"reward_mode=\['sum'\] is illegal; legal: 'sum', 'mean', 'individual'"),
         ({"reward_mode": np.array(["sum", "mean"])}, r"reward_mode=array.* is illegal"),
         ({"terminate_on_success": 1}, r"terminate_on_success=1 is illegal; legal: True or False"),
+        ({"agent_range": 1e30}, r"agent_range=1e\+30 is illegal; legal: a number > 0 and <= 1e\+06"),
+        (
+            {"physics": "solid", "agent_radius": 1e-9, "obstacle_radius": 1e-9},
+            r"physics='solid' can't stop bodies that are so fast \(1\) and so small \(a contact at 2e-09\): make them",
+        ),
         (
             {"agent_radius": 1.0, "num_agents": 12},
             r"agent_0 .. obstacle_1 \(14 bodies\) do not fit: .* missing\)",

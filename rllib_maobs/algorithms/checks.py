@@ -7,7 +7,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,16 +24,17 @@ from rllib_maobs.algorithms import settings
 from rllib_maobs.envs.team import Team, shares_reward
 from rllib_maobs.layout import Layout
 from rllib_maobs.learner import MIXER, JointLearner
+from rllib_maobs.memory import gigabytes, memory_of
 from rllib_maobs.modules import ACTIVATIONS, ACTORS, CRITICS, EntityActor, EntityLSTMActor, RecurrentActor
 from rllib_maobs.modules.agent import ACTOR_ARGUMENTS, COMMON_SETTINGS, CRITIC_ARGUMENTS, network_settings, takes
 from rllib_maobs.modules.exploration import make_exploration
 from rllib_maobs.options import closest
-from rllib_maobs.replay import memory_of
 from rllib_maobs.runner import JointEnvRunner, make_env
 
 if TYPE_CHECKING:
     from rllib_maobs.algorithms.config import JointConfig
 
+_LARGEST, _MOST_LAYERS = 65_536, 100  # units of a layer, layers of a network
 _CRITICS_SEE = (), ("observation", "action"), ("state", "action"), ("state", "joint_action")
 # What a policy's own RLModuleSpec may set.
 _OF_A_POLICY = (*COMMON_SETTINGS, "actor", "actor_settings", "critic", "critic_settings")
@@ -116,11 +117,17 @@ def check_networks(config: JointConfig) -> None:
     model_config = config.model_config
     one_of("model_config['activation']", model_config.get("activation", "relu"), ACTIVATIONS)
     hidden = model_config.get("hidden_sizes", (64,))
-    if not isinstance(hidden, list | tuple) or not hidden or not all(_is_size(size) for size in hidden):
-        raise ValueError(f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}.")
+    listed = isinstance(hidden, list | tuple) and 0 < len(hidden) <= _MOST_LAYERS
+    if not listed or not all(_is_size(size) for size in hidden):
+        raise ValueError(
+            f"model_config['hidden_sizes'] must be positive integers, e.g. (64, 64), not {hidden!r}: up to {_LARGEST} "
+            f"units in up to {_MOST_LAYERS} layers."
+        )
     cell = model_config.get("lstm_cell_size", 64)
     if not _is_size(cell):
-        raise ValueError(f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}.")
+        raise ValueError(
+            f"model_config['lstm_cell_size'] must be a positive integer, e.g. 64, not {cell!r}: up to {_LARGEST}."
+        )
     actor = ACTORS.resolve(config.actor)
     network_settings(actor, model_config, config.actor_settings, ACTOR_ARGUMENTS)
     if config.normalize_observations and issubclass(actor, EntityActor | EntityLSTMActor):
@@ -155,7 +162,7 @@ def check_networks(config: JointConfig) -> None:
 
 
 def _is_size(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value > 0)
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(0 < value <= _LARGEST)
 
 
 def _check_model_config(given: Any, what: str, legal: Collection[str]) -> None:
@@ -321,8 +328,34 @@ def built_modules(config: JointConfig) -> dict[str, RLModule]:
     team = config.team
     spaces = {mid: team.spaces(agent) for agent, mid in zip(team.agents, config.module_ids, strict=True)}
     specs = config.get_multi_rl_module_spec(spaces=spaces).rl_module_specs
+    if any(_is_wide(spec.model_config) for spec in specs.values()):
+        _check_size(specs)
     with torch.random.fork_rng(devices=[]):  # the run's own networks start as if there had been no check
         return {mid: spec.build() for mid, spec in specs.items()}
+
+
+def _is_wide(settings: Any) -> bool:
+    """Whether there is a number among settings that may stand for a large layer."""
+    if isinstance(settings, Mapping):
+        settings = [*settings.values()]
+    if isinstance(settings, list | tuple):
+        return any(map(_is_wide, settings))
+    return isinstance(settings, int | np.integer) and bool(settings > 2048)
+
+
+def _check_size(specs: Mapping[str, RLModuleSpec]) -> None:
+    """Raises a ValueError if networks do not fit into memory, before they are put there."""
+    try:
+        with torch.device("meta"):
+            size = sum(value.nbytes for spec in specs.values() for value in spec.build().state_dict().values())
+    except (NotImplementedError, RuntimeError):  # a user's network takes real numbers, or a size is beyond PyTorch
+        size = 0
+    # The parameters themselves, their gradients and Adam's two moments.
+    if (needed := 4 * size) > (memory := memory_of("cpu")):
+        raise ValueError(
+            f"The networks take {gigabytes(needed)} while they learn, and there are {gigabytes(memory)}: make them "
+            f"smaller, e.g. by rl_module(model_config={{'hidden_sizes': (64, 64)}})."
+        )
 
 
 def check_machine(config: JointConfig) -> None:
@@ -337,7 +370,7 @@ def check_machine(config: JointConfig) -> None:
     size = 8 * observations * len(team.agents) * team.observation_size  # now and next, in single precision
     if size > (memory := memory_of("cuda" if config.num_gpus_per_learner > 0 else "cpu")):
         raise ValueError(
-            f"A minibatch takes {size / 1e9:,.1f} GB, and there are {memory / 1e9:,.1f} GB: lower "
+            f"A minibatch takes {gigabytes(size)}, and there are {gigabytes(memory)}: lower "
             f"train_batch_size_per_learner ({config.train_batch_size_per_learner}) or seq_length "
             f"({config.seq_length}, with recurrent actors)."
         )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
@@ -42,14 +44,39 @@ class Supports:
     twin_critics: bool = True
 
 
-def _checked(method: Callable[..., Any]) -> Callable[..., Any]:
-    """One of RLlib's methods, which checks the values that it is given, and takes NumPy's numbers."""
+MethodT = TypeVar("MethodT", bound=Callable[..., Any])
+
+
+def _checked(method: MethodT) -> MethodT:
+    """A method that sets settings: it checks what it is given, takes NumPy's numbers, and changes all or nothing."""
+    signature = inspect.signature(method)
+    anything = any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values())
 
     @functools.wraps(method)
     def checked(self: JointConfig, *args: Any, **kwargs: Any) -> Any:
-        return method(self, *args, **settings.checked(self, kwargs))
+        for name in kwargs:
+            if name not in signature.parameters and not anything:
+                raise ValueError(settings.unknown(self, name))
+        given = signature.bind_partial(self, *args, **kwargs)
+        named = {name: value for name, value in given.arguments.items() if name not in ("self", "kwargs")}
+        with _as_before_if_refused(self):
+            return method(self, **settings.checked(self, {**named, **given.kwargs}))
 
-    return checked
+    return cast(MethodT, checked)
+
+
+@contextmanager
+def _as_before_if_refused(config: JointConfig) -> Iterator[None]:
+    """Takes back what was set where one of the settings is refused, and makes every refusal a ValueError."""
+    before = {name: dict(value) if type(value) is dict else value for name, value in vars(config).items()}
+    try:
+        yield
+    except Exception as error:
+        config.__dict__.clear()
+        config.__dict__.update(before)
+        if isinstance(error, AssertionError | TypeError | LookupError):  # how RLlib refuses some values
+            raise ValueError(f"RLlib can't take these settings of {type(config).__name__}: {error!r}.") from error
+        raise
 
 
 class JointConfig(AlgorithmConfig):
@@ -130,7 +157,13 @@ class JointConfig(AlgorithmConfig):
         self.rollout_fragment_length = "auto"
         self.min_sample_timesteps_per_iteration = 1000
 
+    def __init_subclass__(cls) -> None:
+        """Lets the settings that an algorithm adds be checked when they are given, as all others are."""
+        if "training" in vars(cls):
+            cls.training = _checked(cls.training)  # type: ignore[method-assign]
+
     @override(AlgorithmConfig)
+    @_checked
     def training(
         self,
         *,
@@ -237,7 +270,7 @@ class JointConfig(AlgorithmConfig):
         if "carry_hidden" in kwargs:
             raise ValueError("carry_hidden is now called stored_state (Kapturowski et al. 2019's term).")
         settings.check_arguments(self, kwargs)
-        super().training(**settings.checked(self, kwargs))
+        super().training(**kwargs)
         given = {k: v for k, v in locals().items() if k not in ("self", "kwargs", "__class__")}
         for name, value in given.items():
             if value is not NotProvided:
@@ -247,15 +280,32 @@ class JointConfig(AlgorithmConfig):
     @override(AlgorithmConfig)
     def update_from_dict(self, config_dict: dict[str, Any]) -> Self:
         """Changes settings, e.g. by Tune's `param_space`, whichever of their names in RLlib they are given by."""
-        super().update_from_dict(settings.as_attributes(config_dict))
+        if not isinstance(config_dict, Mapping) or not all(isinstance(name, str) for name in config_dict):
+            raise ValueError(f"A configuration is changed by a dict of settings by name, not {config_dict!r}.")
+        for name in config_dict:
+            settings.check_is_no_part(self, name)
+        with _as_before_if_refused(self):
+            super().update_from_dict(settings.as_attributes(config_dict))
         return self
 
-    # RLlib's methods that calculate with what they are given.
+    # RLlib's methods that set settings.
+    python_environment = _checked(AlgorithmConfig.python_environment)
+    resources = _checked(AlgorithmConfig.resources)
+    framework = _checked(AlgorithmConfig.framework)
+    api_stack = _checked(AlgorithmConfig.api_stack)
     environment = _checked(AlgorithmConfig.environment)
     env_runners = _checked(AlgorithmConfig.env_runners)
     learners = _checked(AlgorithmConfig.learners)
+    callbacks = _checked(AlgorithmConfig.callbacks)
     evaluation = _checked(AlgorithmConfig.evaluation)
+    offline_data = _checked(AlgorithmConfig.offline_data)
     multi_agent = _checked(AlgorithmConfig.multi_agent)
+    reporting = _checked(AlgorithmConfig.reporting)
+    checkpointing = _checked(AlgorithmConfig.checkpointing)
+    debugging = _checked(AlgorithmConfig.debugging)
+    fault_tolerance = _checked(AlgorithmConfig.fault_tolerance)
+    rl_module = _checked(AlgorithmConfig.rl_module)
+    experimental = _checked(AlgorithmConfig.experimental)
 
     @override(AlgorithmConfig)
     def get_evaluation_config_object(self) -> JointConfig | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from ray.rllib.algorithms.algorithm_config import DEPRECATED_VALUE, AlgorithmConfig
+from ray.rllib.algorithms.algorithm_config import DEPRECATED_VALUE, AlgorithmConfig, NotProvided
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
@@ -45,7 +45,7 @@ LEGAL: dict[str, Any] = {
     "observation_layouts": Mapping | None,
     "seq_length": PositiveInt,
     "stored_state": bool,
-    "n_step": PositiveInt,
+    "n_step": Annotated[int, Range(1, 1000)],  # each of them is one more look into replay, in every update
     "twin_critics": bool,
     "policy_delay": PositiveInt,
     "target_noise": NonNegative,
@@ -439,10 +439,13 @@ def checked(config: JointConfig, given: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: If a value is not legal; says what is.
     """
     owner = type(config).__name__
-    return {
-        name: check_value(plain(value), config.legal[name], name, owner) if name in config.legal else plain(value)
-        for name, value in given.items()
-    }
+    values = {name: plain(value) for name, value in given.items()}
+    for name, value in values.items():
+        if name in config.legal and value is not NotProvided:
+            values[name] = check_value(value, config.legal[name], name, owner)
+            if name in _RATES:
+                check_schedule(name, value)
+    return values
 
 
 def check_values(config: JointConfig) -> None:
@@ -457,8 +460,11 @@ def check_values(config: JointConfig) -> None:
     for name, hint in config.legal.items():
         attribute = _ATTRIBUTES.get(name, name)
         setattr(config, attribute, check_value(getattr(config, attribute), hint, name, type(config).__name__))
-    for name in ("actor_lr", "critic_lr"):
+    for name in _RATES:
         check_schedule(name, getattr(config, name, 0.0))
+
+
+_RATES = ("actor_lr", "critic_lr")
 
 
 def check_schedule(name: str, rate: Any) -> None:
@@ -476,6 +482,14 @@ def check_schedule(name: str, rate: Any) -> None:
         )
 
 
+def check_is_no_part(config: JointConfig, name: str) -> None:
+    """Raises a ValueError for the name of what a configuration does or is, and not of a setting."""
+    if name in dir(object) or callable(getattr(type(config), name, None)):
+        raise ValueError(
+            f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
+        )
+
+
 def check_known(config: JointConfig) -> None:
     """Checks that there is no setting that nobody knows, and none that would do nothing.
 
@@ -486,10 +500,7 @@ def check_known(config: JointConfig) -> None:
     for name in vars(config):
         if name in defaults or name in _FILLED_IN or name.startswith("__"):  # Tune's own begin so
             continue
-        if callable(getattr(type(config), name, None)):
-            raise ValueError(
-                f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
-            )
+        check_is_no_part(config, name)
         raise ValueError(unknown(config, name))
     refused = {attribute_of(name): (name, why) for name, why in REFUSED.items()}
     for name, value, default in changed(config):

@@ -13,7 +13,8 @@ from rllib_maobs.envs.world import Bodies, FloatArray, World
 from rllib_maobs.layout import Entities, Layout, split
 from rllib_maobs.options import Range
 
-Positive = Range(0.0, exclusive=True)
+# With larger numbers the physics would leave what single precision can tell.
+Positive, NonNegative = Range(0.0, 1e6, exclusive=True), Range(0.0, 1e6)
 MOST = 1000  # bodies of a kind; every pair of bodies takes some bytes in every copy
 TARGET_RADIUS = 0.05  # targets touch nothing: for pictures alone
 
@@ -27,8 +28,8 @@ class TargetOptions(ScenarioOptions):
     obstacle_radius: Annotated[float, Positive] = 0.1
     goal_radius: Annotated[float, Positive] = 0.1
     reward_mode: Literal["sum", "mean", "individual"] = "sum"
-    agent_collision_penalty: Annotated[float, Range(0.0)] = 1.0
-    obstacle_collision_penalty: Annotated[float, Range(0.0)] = 1.0
+    agent_collision_penalty: Annotated[float, NonNegative] = 1.0
+    obstacle_collision_penalty: Annotated[float, NonNegative] = 1.0
     accel: Annotated[float, Positive] = 5.0
     max_speed: Annotated[float, Positive] | None = 1.0
 

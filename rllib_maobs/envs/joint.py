@@ -7,7 +7,7 @@ environment lists its agents.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from inspect import signature
@@ -24,6 +24,7 @@ from rllib_maobs.envs.registry import SCENARIOS
 from rllib_maobs.envs.rllib_env import MAObsEnv
 from rllib_maobs.envs.team import Bool, Float, Groups, JointEnv, StepResult
 from rllib_maobs.envs.time_limit import time_limit
+from rllib_maobs.options import as_list
 
 
 def register_envs() -> list[str]:
@@ -151,9 +152,8 @@ class StackedEnv:
                 f"{self._name} is an AEC environment, whose agents act in turns; legal are RLlib MultiAgentEnvs and "
                 f"PettingZoo ParallelEnvs: use its parallel_env(), or pettingzoo.utils.aec_to_parallel(env)."
             )
-        agents = getattr(env, "possible_agents", None)
-        self.agents: list[str] = list(agents) if isinstance(agents, Iterable) else []
-        if not self.agents:
+        self.agents: list[str] = as_list(getattr(env, "possible_agents", None)) or []
+        if not self.agents or not all(isinstance(agent, Hashable) for agent in self.agents):
             raise ValueError(
                 f"{env} lists no `possible_agents`; legal are RLlib MultiAgentEnvs and PettingZoo ParallelEnvs "
                 f"with a fixed team."
@@ -367,7 +367,8 @@ class StackedEnv:
         """What an episode's last infos say of it under "episode_metrics", whichever agent's have it."""
         metrics: dict[str, float] = {}
         for agent, info in infos.items():
-            given = (info or {}).get("episode_metrics") or {}
+            given = (info or {}).get("episode_metrics")
+            given = {} if given is None else given
             try:
                 metrics |= {name: float(_numbers(value).item()) for name, value in given.items()}
             except (AttributeError, TypeError, ValueError):
@@ -397,7 +398,7 @@ class StackedEnv:
 
     def _stack(self, obs: Mapping[str, Any], copy: int) -> Float:
         if set(obs) != set(self.agents):
-            missing, extra = sorted(set(self.agents) - set(obs)), sorted(set(obs) - set(self.agents))
+            missing, extra = (sorted(gone, key=str) for gone in ({*self.agents} - {*obs}, {*obs} - {*self.agents}))
             raise ValueError(
                 f"{self._name}: the team changed in environment copy {copy} at step {self._steps[copy]}: missing "
                 f"agents {missing}, unexpected agents {extra}. Joint learning needs all of {self.agents} in every "

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.coverage import MOST, Positive, others
+from rllib_maobs.envs.coverage import MOST, NonNegative, Positive, others
 from rllib_maobs.envs.placement import Placement
 from rllib_maobs.envs.scenario import Outcome, Scenario, ScenarioOptions
 from rllib_maobs.envs.steering import steer, thrust
@@ -27,12 +27,12 @@ class PredatorPreyOptions(ScenarioOptions):
     predator_radius: Annotated[float, Positive] = 0.075
     prey_radius: Annotated[float, Positive] = 0.05
     obstacle_radius: Annotated[float, Positive] = 0.2
-    capture_reward: Annotated[float, Range(0.0)] = 10.0
-    shaping: Annotated[float, Range(0.0)] = 0.0
-    agent_collision_penalty: Annotated[float, Range(0.0)] = 1.0
-    obstacle_collision_penalty: Annotated[float, Range(0.0)] = 1.0
+    capture_reward: Annotated[float, NonNegative] = 10.0
+    shaping: Annotated[float, NonNegative] = 0.0
+    agent_collision_penalty: Annotated[float, NonNegative] = 1.0
+    obstacle_collision_penalty: Annotated[float, NonNegative] = 1.0
     placement: Literal["separated", "mpe"] = "separated"
-    clearance: Annotated[float, Range(0.0)] = 0.02
+    clearance: Annotated[float, NonNegative] = 0.02
     agent_range: Annotated[float, Positive] = 1.0
     obstacle_range: Annotated[float, Positive] = 0.9
     prey_range: Annotated[float, Positive] = 1.0

@@ -55,7 +55,7 @@ def check_render_mode(mode: str | None) -> None:
     """Raise a ValueError for an unknown mode, and an ImportError if pictures cannot be drawn."""
     if mode is None:
         return
-    if mode not in RENDER_MODES:
+    if not isinstance(mode, str) or mode not in RENDER_MODES:
         raise ValueError(f"render_mode={mode!r} is illegal; legal: {', '.join(map(repr, RENDER_MODES))} or None")
     import_pygame()
 

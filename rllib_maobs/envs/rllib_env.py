@@ -47,6 +47,8 @@ class MAObsEnv(MultiAgentEnv):
         if not isinstance(config, Mapping | None):
             raise ValueError(f'the env config must be a dict, such as {{"scenario": "spread-9a"}}, not {config!r}')
         options = dict(config or {})
+        if unnamed := [name for name in options if not isinstance(name, str)]:
+            raise ValueError(f"the env config has options by name; {unnamed[0]!r} is no name")
         if "scenario" not in options:
             raise ValueError('the env config needs a "scenario", such as {"scenario": "spread-9a"}')
         self.render_mode = options.pop("render_mode", None)

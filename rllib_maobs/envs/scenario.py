@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World
+from rllib_maobs.envs.world import Bodies, FloatArray, Wall, World, checked_bodies
 from rllib_maobs.layout import Entities, Layout, flat, layout_size, split
 from rllib_maobs.options import Range, build_options
 
@@ -161,8 +161,11 @@ class Scenario(ABC, Generic[OptionsT]):
         if not self._overrides("observation_layout") and not self._overrides("observation_size"):
             raise TypeError(f"{owner} does not say what its agents observe: override Scenario.observation_layout")
         self.options: OptionsT = build_options(self.options_class, options, owner)  # type: ignore[assignment]
-        acting = self.agent_groups()
-        self.agents = [f"{g.name}_{i}" for g in self.bodies() if g.name in acting for i in range(g.count)]
+        bodies = checked_bodies(self.bodies(), owner)
+        acting, names = list(self.agent_groups()), [group.name for group in bodies]
+        self.agents = [f"{g.name}_{i}" for g in bodies if g.name in acting for i in range(g.count)]
+        if acting != names[: len(acting)] or not self.agents:
+            raise ValueError(f"{owner}: groups {acting} of {names} act; legal: the first ones, with one agent at least")
 
     def __repr__(self) -> str:
         options = ", ".join(f"{name}={value!r}" for name, value in asdict(self.options).items())

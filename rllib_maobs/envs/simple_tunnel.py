@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from rllib_maobs.envs.coverage import MOST, TARGET_RADIUS, Positive, others, share_rewards
+from rllib_maobs.envs.coverage import MOST, TARGET_RADIUS, NonNegative, Positive, others, share_rewards
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.scenario import Outcome, Scenario
 from rllib_maobs.envs.steering import take_turns, thrust
@@ -27,7 +27,7 @@ class SimpleTunnelOptions(GapOptions):
     column_spacing: Annotated[float, Positive] = 0.25
     wall_x: Annotated[float, Positive] = 1.4
     wall_y: Annotated[float, Positive] = 1.0
-    wall_collision_penalty: Annotated[float, Range(0.0)] = 1.0
+    wall_collision_penalty: Annotated[float, NonNegative] = 1.0
 
 
 class SimpleTunnel(Scenario[SimpleTunnelOptions]):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rllib_maobs.envs.rendering import FRAMES_PER_SECOND, Frame, Renderer, check_render_mode
 from rllib_maobs.envs.scenario import Scenario
-from rllib_maobs.envs.vector import VectorEnv
+from rllib_maobs.envs.vector import VectorEnv, as_array
 
 ByAgent = dict[str, Any]
 
@@ -56,7 +56,7 @@ class SingleCopy:
             missing = [agent for agent in agents if agent not in actions]
             unknown = [agent for agent in actions if agent not in agents]
             raise ValueError(f"actions must come from {agents}; missing: {missing}, unknown: {unknown}")
-        joint = np.stack([self._check_action(agent, np.asarray(actions[agent])) for agent in agents])[None]
+        joint = np.stack([self._check_action(agent, actions[agent]) for agent in agents])[None]
         observations, rewards, terminated, truncated, info = self.env.step(joint)
         if self._renderer is not None:
             self._renderer.note_step()
@@ -108,8 +108,9 @@ class SingleCopy:
         rows_and_sizes = zip(self.env.agents, rows, self._sizes, strict=True)
         return {agent: row[:size] for agent, row, size in rows_and_sizes}
 
-    def _check_action(self, agent: str, action: NDArray[Any]) -> NDArray[Any]:
+    def _check_action(self, agent: str, given: Any) -> NDArray[Any]:
         """Check what cannot be told any more, or not by agent, when all actions are one array."""
+        action = as_array(given, f"the action of {agent}")
         expected = self.env.action_spaces[agent].shape
         if action.shape != expected:
             raise ValueError(f"action of {agent} has shape {action.shape}; expected {expected}")

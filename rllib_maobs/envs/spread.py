@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.random import Generator
 
-from rllib_maobs.envs.coverage import MOST, Coverage, CoverageOptions, Positive
+from rllib_maobs.envs.coverage import MOST, Coverage, CoverageOptions, NonNegative, Positive
 from rllib_maobs.envs.placement import Placement
 from rllib_maobs.envs.steering import assign, steer, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
@@ -20,7 +20,7 @@ class SpreadOptions(CoverageOptions):
 
     num_obstacles: Annotated[int, Range(0, MOST)] = 2
     placement: Literal["separated", "mpe"] = "separated"
-    clearance: Annotated[float, Range(0.0)] = 0.02
+    clearance: Annotated[float, NonNegative] = 0.02
     agent_range: Annotated[float, Positive] = 1.0
     obstacle_range: Annotated[float, Positive] = 0.9
 

@@ -222,7 +222,8 @@ class Team:
 
 def layouts_of(env: Any) -> Mapping[str, Groups | None]:
     """What an environment says its observations are made of, by agent; empty if it does not say."""
-    layouts = getattr(env, "observation_layouts", None) or {}
+    layouts = getattr(env, "observation_layouts", None)
+    layouts = {} if layouts is None else layouts
     if not isinstance(layouts, Mapping):
         raise ValueError(f"An environment's observation_layouts must be a dict by agent, not {layouts!r}.")
     return layouts

@@ -7,11 +7,10 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.random import Generator
 
-from rllib_maobs.envs.coverage import Coverage, CoverageOptions, Positive, TargetOptions
+from rllib_maobs.envs.coverage import Coverage, CoverageOptions, NonNegative, Positive, TargetOptions
 from rllib_maobs.envs.placement import FixedLayout
 from rllib_maobs.envs.steering import assign, take_turns, thrust
 from rllib_maobs.envs.world import Bodies, FloatArray, World
-from rllib_maobs.options import Range
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class GapOptions(TargetOptions):
     start_distance: Annotated[float, Positive] = 1.0
     target_distance: Annotated[float, Positive] = 1.0
     spacing: Annotated[float, Positive] = 0.3
-    start_noise: Annotated[float, Range(0.0)] = 0.0
+    start_noise: Annotated[float, NonNegative] = 0.0
 
 
 @dataclass(frozen=True)

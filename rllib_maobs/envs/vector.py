@@ -8,9 +8,11 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from rllib_maobs.envs.checking import check_outcome, check_scenario, checked_places
 from rllib_maobs.envs.metrics import EpisodeTracker
 from rllib_maobs.envs.scenario import Scenario
 from rllib_maobs.layout import Layout, as_layout
+from rllib_maobs.memory import gigabytes, memory_of
 
 Info = dict[str, Any]
 
@@ -56,6 +58,7 @@ class VectorEnv:
     def __init__(self, scenario: Scenario[Any], num_envs: int = 1) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} is illegal; legal: an integer >= 1")
+        check_scenario(scenario)
         self.scenario = scenario
         self.num_envs = int(num_envs)
         self.agents = list(scenario.agents)
@@ -80,21 +83,26 @@ class VectorEnv:
         self.shared_reward = scenario.shared_reward
         self.action_spaces = {agent: scenario.action_space() for agent in self.agents}
         action_shape: tuple[int, ...] = scenario.action_space().shape or ()
-        self._actions_shape = (num_envs, n, *action_shape)
+        self._actions_shape = (self.num_envs, n, *action_shape)
         self._discrete = scenario.options.action_mode == "discrete"
 
-        try:
-            self.world = scenario.make_world(num_envs)
-        except MemoryError as error:
-            raise ValueError(f"num_envs={num_envs}: so many copies do not fit into memory ({error})") from None
+        # Of every pair of a body that moves and any other there are offset, distance, gap, and room to compute them.
+        bodies = scenario.bodies()
+        pairs = sum(group.count for group in bodies if group.movable) * sum(group.count for group in bodies)
+        if (size := 48 * self.num_envs * pairs) > memory_of("cpu"):
+            raise ValueError(
+                f"num_envs={num_envs}: so many copies do not fit into memory (they take {gigabytes(size)})"
+            )
+        self.world = scenario.make_world(self.num_envs)
         accel = [g.accel for g in self.world.groups if g.movable for _ in range(g.count)]
         self._accel = np.array(accel)[:, None]
-        self.seeds: NDArray[np.int64] = np.full(num_envs, -1, np.int64)
+        self.seeds: NDArray[np.int64] = np.full(self.num_envs, -1, np.int64)
         self._rngs: list[Generator] | None = None
         self._tracker = EpisodeTracker(scenario, self.world)
-        self._steps = np.zeros(num_envs, np.int64)
+        self._steps = np.zeros(self.num_envs, np.int64)
         # A copy that was never reset is treated like one that has finished: it must be reset.
-        self._finished = np.ones(num_envs, bool)
+        self._finished = np.ones(self.num_envs, bool)
+        self._checked = False
 
     def reset(
         self, seed: int | Sequence[int] | None = None, mask: NDArray[np.bool_] | None = None
@@ -109,11 +117,12 @@ class VectorEnv:
         Returns:
             (E, N, O) observations of all copies, and an empty info.
         """
-        copies = np.flatnonzero(self._check_mask(mask))
-        self._seed(seed, copies)
+        copies, seeds = np.flatnonzero(self._check_mask(mask)), self._check_seed(seed)
+        self._seed(seeds, copies)
         assert self._rngs is not None
         if copies.size:
-            self.world.position[copies] = self.scenario.place([self._rngs[e] for e in copies.tolist()])
+            position = self.scenario.place([self._rngs[e] for e in copies.tolist()])
+            self.world.position[copies] = checked_places(self.scenario, position, copies.size, self.world.num_bodies)
             self.world.velocity[copies] = 0.0
             self._tracker.reset(copies)
             self._steps[copies] = 0
@@ -151,6 +160,9 @@ class VectorEnv:
         self._steps += 1
 
         outcome = scenario.outcome(world)
+        if not self._checked:  # all steps are alike
+            check_outcome(scenario, outcome, self.num_envs)
+            self._checked = True
         self._tracker.update(world, outcome)
         ends = outcome.success if scenario.options.terminate_on_success else np.zeros(self.num_envs, bool)
         terminated = np.array(ends, bool)
@@ -223,27 +235,32 @@ class VectorEnv:
     def _check_mask(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, bool)
-        mask = np.asarray(mask)
+        mask = as_array(mask, "mask")
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"mask is {mask.dtype} of shape {mask.shape}; expected bool of shape ({self.num_envs},)")
         return mask
 
-    def _seed(self, seed: int | Sequence[int] | None, copies: NDArray[np.intp]) -> None:
+    def _check_seed(self, seed: int | Sequence[int] | None) -> NDArray[np.int64] | None:
+        """Return the (E,) seeds that are meant; None for none."""
+        if seed is None:
+            return None
+        seeds = as_array(seed, "seed")
+        if seeds.shape == () and seeds.dtype.kind in "iu":
+            seeds = seeds + np.arange(self.num_envs)
+        if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
+            raise ValueError(f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None")
+        return seeds
+
+    def _seed(self, seeds: NDArray[np.int64] | None, copies: NDArray[np.intp]) -> None:
         """Give the copies new generators, or leave them theirs; the first time, all copies get one."""
         if self._rngs is None:
             first = int(np.random.SeedSequence().generate_state(1)[0])
             self.seeds[:] = first + np.arange(self.num_envs)
             self._rngs = [np.random.default_rng(s) for s in self.seeds]
-        if seed is None:
-            return
-        seeds = np.asarray(seed)
-        if seeds.shape == () and seeds.dtype.kind in "iu":
-            seeds = seeds + np.arange(self.num_envs)
-        if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
-            raise ValueError(f"seed={seed!r} is illegal; legal: an integer >= 0, or {self.num_envs} of them, or None")
-        self.seeds[copies] = seeds[copies]
-        for e in copies.tolist():
-            self._rngs[e] = np.random.default_rng(self.seeds[e])
+        if seeds is not None:
+            self.seeds[copies] = seeds[copies]
+            for e in copies.tolist():
+                self._rngs[e] = np.random.default_rng(self.seeds[e])
 
     def check_begun(self, method: str) -> None:
         """Raise a RuntimeError if the environment was never reset: bodies then have no places yet."""
@@ -265,10 +282,7 @@ class VectorEnv:
         )
 
     def _check_actions(self, joint: NDArray[Any]) -> NDArray[Any]:
-        try:
-            actions = np.asarray(joint)
-        except ValueError as error:  # rows of different lengths
-            raise ValueError(f"actions are no array: {error}") from None
+        actions = as_array(joint, "actions")
         if actions.shape != self._actions_shape:
             letters = "(E, N)" if self._discrete else "(E, N, A)"
             raise ValueError(f"actions have shape {actions.shape}; expected {letters} = {self._actions_shape}")
@@ -287,3 +301,11 @@ class VectorEnv:
         if bad.any():
             copy, agent = np.argwhere(bad)[0]
             raise ValueError(f"action of {self.agents[agent]} in copy {copy} is {reason}: {actions[copy, agent]}")
+
+
+def as_array(values: Any, name: str) -> NDArray[Any]:
+    """Return an array of what was given under a name; raise a ValueError that has the name if there is none."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as error:  # such as rows of different lengths
+        raise ValueError(f"{name} {'are' if name.endswith('s') else 'is'} no array: {error}") from None

@@ -7,15 +7,19 @@ contacts amplify rounding errors; only observations are float32.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from rllib_maobs.options import Range, check_value
 
 FloatArray = NDArray[np.float64]
 
 # Beyond this gap the contact force of MPE is below 1e-20: not worth computing.
 _REACH = 0.05
+MOST_BODIES = 5000
+_STIFFEST = 10_000.0  # a hundred times as many steps
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,36 @@ class Bodies:
     accel: float = 1.0
     max_speed: float | None = None
     limit: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, legal in _LEGAL.items():
+            object.__setattr__(self, name, check_value(getattr(self, name), legal, name, "Bodies"))
+
+
+_Positive = Annotated[float, Range(0.0, 1e6, exclusive=True)]
+_NonNegative = Annotated[float, Range(0.0, 1e6)]
+_LEGAL: dict[str, Any] = {
+    "name": str,
+    "count": Annotated[int, Range(0)],
+    "radius": _Positive,
+    "movable": bool,
+    "collides": bool,
+    "accel": _NonNegative,
+    "max_speed": _NonNegative | None,
+    "limit": _Positive | None,
+}
+
+
+def checked_bodies(bodies: Any, owner: str) -> Sequence[Bodies]:
+    """Return what a scenario has as its bodies, or raise a ValueError unless they are a list of groups with names."""
+    if not isinstance(bodies, Sequence) or not bodies or not all(isinstance(group, Bodies) for group in bodies):
+        raise ValueError(f"{owner}.bodies() returns {bodies!r}; legal: a list of Bodies, those that act first")
+    names, count = [group.name for group in bodies], sum(group.count for group in bodies)
+    if len(set(names)) < len(names):
+        raise ValueError(f"{owner}.bodies() returns groups {names}; legal are different names")
+    if count > MOST_BODIES:  # there are arrays of all pairs
+        raise ValueError(f"{owner}.bodies() returns {count} bodies; legal: up to {MOST_BODIES}")
+    return bodies
 
 
 @dataclass(frozen=True)
@@ -99,8 +133,13 @@ def _solid(groups: Sequence[Bodies]) -> Physics:
     if not moving or max(speeds) == 0.0:
         return physics
     contact = min(g.radius for g in moving) + min(g.radius for g in groups if g.collides)
-    needed = 1.5 * physics.mass * (2.0 * max(speeds) / contact) ** 2 / 2.0
+    needed = 1.5 * physics.mass * min(2.0 * max(speeds) / contact, 1e100) ** 2 / 2.0
     stiffer = max(1.0, needed / physics.contact_force)
+    if not stiffer <= _STIFFEST:
+        raise ValueError(
+            f"physics='solid' can't stop bodies that are so fast ({max(speeds):g}) and so small (a contact at "
+            f"{contact:g}): make them slower (max_speed) or larger, or use physics='mpe'"
+        )
     return replace(
         physics,
         contact_force=physics.contact_force * stiffer,

@@ -13,6 +13,7 @@ from rllib_maobs.envs.joint import StackedEnv, make_copy, make_joint_env, regist
 from rllib_maobs.envs.team import JointEnv, Team
 from rllib_maobs.envs.time_limit import check_time_limits
 from rllib_maobs.envs.wrappers import InOrder, WithAgentIds
+from rllib_maobs.options import closest
 
 logger = logging.getLogger(__name__)
 
@@ -24,12 +25,13 @@ def env_creator(config: AlgorithmConfig) -> Any:
         ValueError: If `config.env` is neither a registered name nor an environment class.
     """
     register_envs()  # names are lost when Ray restarts
-    if isinstance(config.env, type):
+    if isinstance(config.env, type) and hasattr(config.env, "reset") and hasattr(config.env, "step"):
         return config.env
     if isinstance(config.env, str) and _global_registry.contains(ENV_CREATOR, config.env):
         return _global_registry.get(ENV_CREATOR, config.env)
+    hint = closest(config.env, register_envs()) if isinstance(config.env, str) else ""
     raise ValueError(
-        f"Unknown environment {config.env!r}; legal are {', '.join(sorted(register_envs()))}, a name registered "
+        f"Unknown environment {config.env!r}{hint}; legal are {', '.join(sorted(register_envs()))}, a name registered "
         f"with ray.tune.register_env, or an environment class."
     )
 
