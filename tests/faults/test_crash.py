@@ -1,8 +1,10 @@
 """Trainings that are killed at any moment, and go on as if nothing had happened."""
 
 import contextlib
+import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from ray.tune.result import SHOULD_CHECKPOINT
 from rllib_maobs.experiment.claim import hold, wait_until_free
 from rllib_maobs.experiment.keeping import LOGS, SAVING, find_unfit, last_result
 from rllib_maobs.experiment.preemption import EXIT_CODE, Preemption
-from rllib_maobs.experiment.resume import STATES
+from rllib_maobs.experiment.resume import STATES, take_up
 from rllib_maobs.whole import numbered
 from tests.faults.tiny import EXPERIMENT, ITERATION, TRIAL, flip, iterations, rows, uninterrupted, weights
 
@@ -137,6 +139,14 @@ def test_a_training_that_is_killed_again_and_again(
     assert all(torch.equal(there[name], value) for name, value in networks.items())
     checkpoint = folder / TRIAL / f"checkpoint_{newest(folder):06d}"
     assert (checkpoint / LOGS / "result.json").read_text() == (folder / TRIAL / "result.json").read_text()
+
+    # A trial that is finished stays so if somebody has removed its checkpoints.
+    for path in numbered(folder / TRIAL):
+        shutil.rmtree(path)
+    assert take_up(folder, kept=2)
+    ((trial, _),) = json.loads(max(folder.glob(STATES)).read_text())["trial_data"]
+    assert json.loads(trial)["status"] == "TERMINATED"
+    assert rows(folder) == results
 
 
 def test_sigterm_waits_for_every_trial_that_has_made_an_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
