@@ -133,7 +133,7 @@ def test_a_training_that_is_killed_again_and_again(
         tally["rows lost"] += len(set(expected) - set(found))
     results, networks = uninterrupted(steps)
     assert rows(folder) == results
-    tally["steps lost"] += steps - ITERATION * iterations(folder)["result.json"][-1]
+    tally["steps lost"] += int(steps - ITERATION * iterations(folder)["result.json"][-1])
     there = weights(folder)
     assert there.keys() == networks.keys()
     assert all(torch.equal(there[name], value) for name, value in networks.items())
