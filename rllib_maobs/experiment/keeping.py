@@ -50,7 +50,7 @@ class Keeper(LoggerCallback):
         self._last[trial.trial_id] = str(checkpoint)
         if checkpoint is None:
             for path in numbered(folder):
-                shutil.rmtree(path)
+                put_aside(path)
         put_back_logs(checkpoint, folder, Path(trial.local_path))
 
     def log_trial_save(self, trial: Any) -> None:
@@ -173,6 +173,23 @@ def find_unfit(checkpoint: Path) -> str | None:
         return "its logs are missing"
     fault = find_fault(checkpoint / LOGS)
     return fault and f"{LOGS}/{fault}"
+
+
+def put_aside(checkpoint: Path) -> str:
+    """Take a checkpoint that its trial does not go on from out of the way: one that was whole once is kept.
+
+    Args:
+        checkpoint: Its folder.
+
+    Returns:
+        The name that it has now; "" if it was never finished, and is removed.
+    """
+    if not (checkpoint / LOGS).is_dir():
+        shutil.rmtree(checkpoint)
+        return ""
+    aside = checkpoint.with_name(f"damaged_{checkpoint.name}")
+    shutil.rmtree(aside, ignore_errors=True)
+    return checkpoint.rename(aside).name
 
 
 def mend_state(results_dir: Path) -> None:

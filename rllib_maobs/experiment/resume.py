@@ -3,7 +3,6 @@
 import glob
 import json
 import re
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from ray.tune.experiment.trial import Trial as TuneTrial
 from ray.tune.search.basic_variant import BasicVariantGenerator
 
 from rllib_maobs.experiment.claim import wait_until_free
-from rllib_maobs.experiment.keeping import LOGS, find_unfit, last_result, mend_state, put_back_logs, sweep
+from rllib_maobs.experiment.keeping import LOGS, find_unfit, last_result, mend_state, put_aside, put_back_logs, sweep
 from rllib_maobs.whole import numbered
 
 OUTLIVES = 30.0
@@ -120,7 +119,19 @@ def _take_up_trial(trial: Any, folder: Path, kept: int) -> bool:
     found, unfit = numbered(folder), list[tuple[Path, str]]()
     while found and (fault := find_unfit(found[0])):
         unfit.append((found.pop(0), fault))
-    _put_aside(str(trial), unfit, found[0] if found else None)
+    finished = trial.status == TuneTrial.TERMINATED
+    if found:
+        then = f"the one before it is used: {found[0].name}"
+    else:
+        then = "there is none before it, so it " + ("stays as it is: finished" if finished else "starts anew")
+    for path, fault in unfit:
+        aside = put_aside(path)
+        where = f" (it is kept as {aside})" if aside else ""
+        print(f"{trial}: {path} is no whole checkpoint: {fault}{where}; {then}.", flush=True)
+    if not found and finished:
+        return False
+    if not found and not unfit and trial.checkpoint is not None:
+        print(f"{trial}: its checkpoints are no longer in {folder}, so it starts anew.", flush=True)
     if found and not (found[0] / LOGS).is_dir():
         return False  # saved by a revision that kept no logs: only Tune knows what it belongs to
     config, known = trial.run_metadata.checkpoint_manager.checkpoint_config, trial.run_metadata.last_result
@@ -137,20 +148,6 @@ def _take_up_trial(trial: Any, folder: Path, kept: int) -> bool:
     if trial.status == TuneTrial.TERMINATED:
         put_back_logs(found[0], folder, finished=True)
     return bool(found or known)
-
-
-def _put_aside(trial: str, unfit: list[tuple[Path, str]], used: Path | None) -> None:
-    for path, fault in unfit:
-        was_whole = (path / LOGS).is_dir()
-        if was_whole:
-            path.rename(path.with_name(f"damaged_{path.name}"))
-        else:  # the run was killed while it wrote this one
-            shutil.rmtree(path)
-        goes_on = (
-            f"the one before it is used: {used.name}" if used else "there is none before it: the trial starts anew"
-        )
-        kept = f" (it is kept as damaged_{path.name})" if was_whole else ""
-        print(f"{trial}: {path} is no whole checkpoint: {fault}{kept}; {goes_on}.", flush=True)
 
 
 def forget_decisions(results_dir: Path) -> None:

@@ -1,8 +1,10 @@
 """Trainings that are killed at any moment, and go on as if nothing had happened."""
 
 import contextlib
+import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,15 +13,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
 import ray
 import torch
+from ray.tune.result import SHOULD_CHECKPOINT
 
-from rllib_maobs.experiment.claim import wait_until_free
-from rllib_maobs.experiment.keeping import LOGS, SAVING, find_unfit
+from rllib_maobs.experiment.claim import hold, wait_until_free
+from rllib_maobs.experiment.keeping import LOGS, SAVING, find_unfit, last_result
 from rllib_maobs.experiment.preemption import EXIT_CODE, Preemption
+from rllib_maobs.experiment.resume import STATES, take_up
 from rllib_maobs.whole import numbered
 from tests.faults.tiny import EXPERIMENT, ITERATION, TRIAL, flip, iterations, rows, uninterrupted, weights
 
@@ -32,6 +37,7 @@ def train(folder: Path, *given: str) -> None:
         monkeypatch.setattr("rllib_maobs.experiment.run.film_best", lambda *args: "")
         monkeypatch.setattr("rllib_maobs.experiment.run.play_baselines", lambda *args: {})
         monkeypatch.setattr("rllib_maobs.experiment.run.print_plan", lambda *args: None)
+        monkeypatch.setattr("rllib_maobs.experiment.report.plot_curves", lambda *args, **kwargs: None)
         EXPERIMENT.main(["--results-dir", str(folder), *given])
 
 
@@ -94,18 +100,21 @@ def test_a_training_that_is_killed_again_and_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """First ended by SIGTERM, then killed and resumed: it ends with the rows and weights of the uninterrupted one."""
-    folder, chance, steps = tmp_path / "a [killed] run", random.Random(0), ITERATION * (120 if long else 16)
+    folder, chance, steps = tmp_path / "a [killed] run", random.Random(0), ITERATION * (120 if long else 20)
     stop = threading.Timer(0.0, lambda: (wait_for(lambda: newest(folder) >= 1), os.kill(os.getpid(), signal.SIGTERM)))
     stop.start()
     with pytest.raises(SystemExit) as end:
-        train(folder, "--quick", "--no-compile", "--stop-timesteps", str(steps), "--checkpoint-freq", "1")
+        train(folder, "--quick", "--no-compile", "--stop-timesteps", str(steps), "--checkpoint-freq", "2")
     stop.join()
     assert end.value.code == EXIT_CODE == 143
     assert "SIGTERM: every trial is saved" in (said := capsys.readouterr().out)
     assert "Ended by SIGTERM. Go on with: python " in said
     damaged = numbered(folder / TRIAL)[0]
     assert find_unfit(damaged) is None
+    assert last_result(damaged)["training_iteration"] == len(rows(folder)), "it has not saved what it had done"
     flip(damaged / "replay_buffer" / "state.pkl", bit=1000)
+    (state,) = folder.glob(STATES)
+    state.write_bytes(state.read_bytes()[:1000])  # as Ray leaves it if the program dies while it is copied
     moments = ["any", "save", "start", "copy"] * 5 if long else ["save", "copy"]
     for number, when in enumerate(moments):
         said = kill(folder, when, chance, "--resume")
@@ -124,12 +133,50 @@ def test_a_training_that_is_killed_again_and_again(
         tally["rows lost"] += len(set(expected) - set(found))
     results, networks = uninterrupted(steps)
     assert rows(folder) == results
-    tally["steps lost"] += steps - ITERATION * iterations(folder)["result.json"][-1]
+    tally["steps lost"] += int(steps - ITERATION * iterations(folder)["result.json"][-1])
     there = weights(folder)
     assert there.keys() == networks.keys()
     assert all(torch.equal(there[name], value) for name, value in networks.items())
     checkpoint = folder / TRIAL / f"checkpoint_{newest(folder):06d}"
     assert (checkpoint / LOGS / "result.json").read_text() == (folder / TRIAL / "result.json").read_text()
+
+    # A trial that is finished stays so if somebody has removed its checkpoints.
+    for path in numbered(folder / TRIAL):
+        shutil.rmtree(path)
+    assert take_up(folder, kept=2)
+    ((trial, _),) = json.loads(max(folder.glob(STATES)).read_text())["trial_data"]
+    assert json.loads(trial)["status"] == "TERMINATED"
+    assert rows(folder) == results
+
+
+def test_sigterm_waits_for_every_trial_that_has_made_an_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = list[int]()
+    trials = [SimpleNamespace(trial_id=name, status="RUNNING") for name in ("a", "b", "starts")]
+    with Preemption() as preemption:
+        for trial in trials[:2]:
+            preemption.on_trial_result(0, trials, trial, result := {})
+            assert result == {}
+        preemption.on_trial_save(0, trials, trials[0])  # before the signal: it does not count
+        os.kill(os.getpid(), signal.SIGTERM)
+        monkeypatch.setattr(os, "kill", lambda process, number: ended.append(number))
+        for trial in trials[:2]:
+            assert not ended
+            preemption.on_trial_result(0, trials, trial, result := {})
+            assert result == {SHOULD_CHECKPOINT: True}
+            preemption.on_step_end(0, trials)
+            preemption.on_trial_save(0, trials, trial)
+            preemption.on_step_end(0, trials)
+    assert ended == [signal.SIGUSR1]
+
+
+def test_a_folder_is_free_when_its_process_has_ended(tmp_path: Path) -> None:
+    assert wait_until_free(tmp_path, 0.0)
+    held, too = hold(tmp_path), hold(tmp_path)  # a trial's process that is started again, before the old one has ended
+    assert held is not None and too is not None
+    held.close()
+    assert not wait_until_free(tmp_path, 0.2)
+    too.close()
+    assert wait_until_free(tmp_path, 0.0)
 
 
 def test_a_second_sigterm_ends_at_once() -> None:

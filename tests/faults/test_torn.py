@@ -17,6 +17,7 @@ import pytest
 from ray.train._internal.storage import StorageContext
 
 from rllib_maobs.checkpoints import find_checkpoint, saved_networks
+from rllib_maobs.experiment.claim import wait_until_free
 from rllib_maobs.experiment.keeping import SAVING
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 from rllib_maobs.whole import CHECKSUMS, METADATA, TornError, find_fault, numbered
@@ -218,6 +219,7 @@ def test_a_trial_goes_on_without_a_checkpoint(
     storage = StorageContext(str(tmp_path), "run", trial_dir_name="trial")
     trial, folder = Trial(asdict(spec), storage=storage), tmp_path / "run" / "trial"
     try:
+        assert not wait_until_free(folder, 0.0)  # should it outlive its run, a resumed one waits
         trial.train()
         first = Path(trial.save().checkpoint.path)
         trial.train()
@@ -244,3 +246,4 @@ def test_a_trial_goes_on_without_a_checkpoint(
         assert len(numbered(folder)) == 2
     finally:
         trial.stop()
+    assert wait_until_free(folder, 0.0)
