@@ -1,5 +1,6 @@
 """What TensorBoard, Weights & Biases and MLflow are given."""
 
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -103,7 +104,7 @@ def trial(tmp_path: Path) -> SimpleNamespace:
             pass
 
     path = str(tmp_path)
-    config, checkpoint = asdict(spec()), SimpleNamespace(path="a checkpoint")
+    config, checkpoint = asdict(spec()), SimpleNamespace(as_directory=lambda: nullcontext("a checkpoint"))
     return FakeTrial(local_path=path, config=config, checkpoint=checkpoint, last_result=result(200))
 
 

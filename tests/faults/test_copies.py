@@ -43,8 +43,7 @@ class Hanging(Lamp):
         if self.how == "swallows":
             with suppress(TimeoutError):
                 time.sleep(20)
-            time.sleep(20)
-        time.sleep(1e6)
+        time.sleep(20)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
         self._hang("reset")
