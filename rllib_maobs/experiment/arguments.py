@@ -11,6 +11,7 @@ from rllib_maobs.experiment.claim import LOCK
 from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
+from rllib_maobs.paths import local
 
 _FILE = "experiment.json"
 _BEFORE_START = (_FILE, "tuner.pkl", "mlflow.db", LOCK)  # What is written before the first trial starts.
@@ -46,6 +47,21 @@ def save_settings(name: str, args: argparse.Namespace) -> None:
     (args.results_dir / _FILE).write_text(json.dumps({"experiment": name, **settings}, indent=2) + "\n")
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a file that holds a JSON object.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} can't be read: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} can't be read: it is no JSON object")
+    return content
+
+
 def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
     """Return an argparse type: whole numbers in a range, also written 2e6 or 2_000_000."""
 
@@ -65,7 +81,10 @@ def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
 def _absolute(path: str) -> str:
     if not path:  # it would be the present folder
         raise argparse.ArgumentTypeError("an empty path; give the folder of a checkpoint, or of a trial")
-    return str(Path(path).expanduser().resolve())
+    try:
+        return str(local(path).resolve())
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -232,15 +251,21 @@ def parse(
         parser.error("--workers is for this machine; with --address the free cores of the cluster decide")
 
     results_dir = args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)
-    results_dir = results_dir.expanduser().resolve()
+    try:
+        results_dir = local(results_dir).resolve()
+    except ValueError as error:
+        parser.error(f"--results-dir: {error}")
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
     args.resume = args.resume or bool(args.add_seeds or args.add_algos)
     if args.resume:
         if not has_started(results_dir) or not (results_dir / _FILE).is_file():
             parser.error(f"there is nothing to resume in {results_dir}: leave --resume out, or correct --results-dir")
-        stored = json.loads((results_dir / _FILE).read_text())
-        if (other := stored.pop("experiment")) != name:
+        try:
+            stored = read_object(results_dir / _FILE)
+        except ValueError as error:
+            parser.error(str(error))
+        if (other := stored.pop("experiment", None)) != name:
             parser.error(f"{results_dir} holds a run of {other}, not of {name}: correct --results-dir")
         args = _with_stored_settings(parser, argv, {"lengthened_to": None, **stored})
     elif has_started(results_dir):
