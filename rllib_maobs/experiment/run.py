@@ -403,6 +403,7 @@ def _start_ray(args: Namespace) -> bool:
         address="local",
         num_cpus=args.workers * (1 + args.num_env_runners),
         include_dashboard=args.dashboard,
+        dashboard_host="127.0.0.1",  # who reaches it can run programs here
         log_to_driver=False,
         logging_level=logging.ERROR,
     )
