@@ -111,7 +111,8 @@ def load_networks(algorithm: JointAlgorithm, checkpoint: str | Path) -> None:
     maobs.load_networks(algo, "results/spread-3a/maddpg-entity-seed0")
     ```
 
-    Optimisers and replay start anew; to go on with a run, restore it instead.
+    Optimisers and replay start anew; to go on with a run, restore it instead. Checkpoints are pickles: load those of
+    people you trust only.
 
     Args:
         algorithm: One of this package's.

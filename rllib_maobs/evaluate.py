@@ -15,6 +15,7 @@ of it.
 import argparse
 import json
 import logging
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,6 +28,7 @@ from scipy.stats import bootstrap
 
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
 from rllib_maobs.experiment.tables import format_table
+from rllib_maobs.paths import local
 from rllib_maobs.play import parse_options, play
 from rllib_maobs.policies import BASELINES, make_policy, play_episodes, saved_options, trained_on
 
@@ -85,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--per-episode", type=Path, metavar="FILE", help="write a CSV row for each episode")
     parser.add_argument("--record", type=Path, metavar="FILE", help="film the best one's first episode (.gif or .mp4)")
     args = parser.parse_intermixed_args(arguments)
-    pairs = [text for text in args.checkpoints if "=" in text and not Path(text).exists()]
+    pairs = [text for text in args.checkpoints if "=" in text and not os.path.exists(text)]
     paths = list(dict.fromkeys(text for text in args.checkpoints if text not in pairs))
     files = [path for path in (args.json, args.csv, args.per_episode, args.record) if path is not None]
     try:
@@ -139,7 +141,7 @@ def check_arguments(
         raise ValueError(f"--num-agents {wrong[0]} is illegal; legal: integers >= 1")
     if not checkpoints:
         raise ValueError("nothing to evaluate: give the folder of a checkpoint, or of a trial, or an exported file")
-    for path in files:
+    for path in map(local, files):
         if path.exists():
             raise ValueError(f"{path} exists: remove it, or choose another file")
         if not path.absolute().parent.is_dir():

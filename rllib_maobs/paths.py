@@ -53,8 +53,9 @@ def local(path: Any) -> Path:
     """
     try:
         found = Path(path).expanduser()
-        os.fsencode(found)
-        found.exists()
+        os.stat(found)
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        pass
     except (TypeError, ValueError, OSError, RuntimeError) as error:  # such as NUL, a name too long, an unknown ~user
         raise ValueError(f"{path!r} is no path of a file or folder: {error}") from None
     return found

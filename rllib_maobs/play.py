@@ -79,13 +79,13 @@ def parse_options(pairs: Sequence[str]) -> dict[str, Any]:
         name, equals, text = pair.partition("=")
         if not equals:
             raise ValueError(f"{pair!r} is no option; write NAME=VALUE, such as horizon=50")
-        if name in ("scenario", "render_mode"):
+        if name in ("scenario", "render_mode", "num_envs"):
             raise ValueError(f"{name}=... is no option of a task; legal are those of its class, such as horizon=50")
         if name in options:
             raise ValueError(f"{name}=... is given twice")
         try:
             options[name] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
+        except (ValueError, SyntaxError, MemoryError, RecursionError):  # the last ones are of many brackets
             options[name] = text
     return options
 

@@ -150,7 +150,7 @@ class JointReplayBuffer(Checkpointable):
             raise ValueError(f"recurrent_state must be None or a shape such as (2, 64), not {recurrent_state!r}.")
         try:
             device = torch.device(device)
-        except (RuntimeError, TypeError) as error:
+        except (RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"device must be one of PyTorch's, such as 'cpu' or 'cuda', not {device!r}.") from error
         self.capacity = capacity
         self._arguments: dict[str, Any] = {

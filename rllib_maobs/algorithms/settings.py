@@ -484,7 +484,7 @@ def check_schedule(name: str, rate: Any) -> None:
 
 def check_is_no_part(config: JointConfig, name: str) -> None:
     """Raises a ValueError for the name of what a configuration does or is, and not of a setting."""
-    if name in dir(object) or callable(getattr(type(config), name, None)):
+    if name not in vars(config) and (name in dir(object) or callable(getattr(type(config), name, None))):
         raise ValueError(
             f"{name!r} is part of {type(config).__name__}, not a setting: give the settings by their names."
         )

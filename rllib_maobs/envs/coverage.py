@@ -60,7 +60,7 @@ class Coverage(Scenario[OptionsT]):
         "target_distance": "mean",
     }
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         super().__init__(**options)
         groups = self.bodies()
         self._names = [f"{group.name}_{i}" for group in groups for i in range(group.count)]

@@ -117,7 +117,7 @@ class PredatorPrey(Scenario[PredatorPreyOptions]):
         "prey_distance": "mean",
     }
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         super().__init__(**options)
         o = self.options
         n, m = o.num_predators, o.num_obstacles

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rllib_maobs.envs.rendering import Frame
+from rllib_maobs.paths import local
 
 _WRITERS = {".gif": ("PIL.Image",), ".mp4": ("imageio.v2", "imageio_ffmpeg")}
 
@@ -36,7 +37,7 @@ class Recorder:
     """
 
     def __init__(self, path: str | Path, frames_per_second: int = 10) -> None:
-        self.path = Path(path)
+        self.path = local(path)
         if self.path.suffix.lower() not in _WRITERS:
             raise ValueError(f"cannot record to {str(path)!r}; legal are names that end in {' or '.join(_WRITERS)}")
         for name in _WRITERS[self.path.suffix.lower()]:

@@ -44,7 +44,7 @@ def register_scenario(scenario_id: str, cls: type[Scenario[Any]], **options: Any
     SCENARIOS[scenario_id] = (cls, options)
 
 
-def make_scenario(scenario: str | type[Scenario[Any]], **options: Any) -> Scenario[Any]:
+def make_scenario(scenario: str | type[Scenario[Any]], /, **options: Any) -> Scenario[Any]:
     """Make a scenario from its id or class.
 
     Args:

@@ -156,7 +156,7 @@ class Scenario(ABC, Generic[OptionsT]):
     own_targets: ClassVar[bool] = False
     metrics: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         owner = type(self).__name__
         if not self._overrides("observation_layout") and not self._overrides("observation_size"):
             raise TypeError(f"{owner} does not say what its agents observe: override Scenario.observation_layout")

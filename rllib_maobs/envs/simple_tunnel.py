@@ -97,7 +97,7 @@ class SimpleTunnel(Scenario[SimpleTunnelOptions]):
     options_class = SimpleTunnelOptions
     own_targets = True
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         super().__init__(**options)
         o, n, columns = self.options, self.options.num_agents, self.options.num_columns
         if n % columns:

@@ -92,7 +92,7 @@ class Spread(Coverage[SpreadOptions]):
 
     options_class = SpreadOptions
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         super().__init__(**options)
         o, n, m = self.options, self.options.num_agents, self.options.num_obstacles
         agents, obstacles, targets = range(n), range(n, n + m), range(n + m, 2 * n + m)

@@ -94,7 +94,7 @@ class Tunnel(Coverage[TunnelOptions]):
 
     options_class = TunnelOptions
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, /, **options: Any) -> None:
         super().__init__(**options)
         o, n = self.options, self.options.num_agents
         check_gap(o.gap, o.agent_radius, o.obstacle_radius)

@@ -12,7 +12,7 @@ from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
 from rllib_maobs.experiment.storage import Storage, is_url
 from rllib_maobs.experiment.sweep import OF_THE_PAPER, SEARCHED
-from rllib_maobs.paths import write_aside
+from rllib_maobs.paths import local, write_aside
 
 _FILE = "experiment.json"
 _BEFORE_START = (_FILE, "tuner.pkl", "mlflow.db", LOCK)  # What is written before the first trial starts.
@@ -49,6 +49,21 @@ def save_settings(name: str, args: argparse.Namespace) -> None:
     write_aside(args.results_dir / _FILE, text.encode())
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a file that holds a JSON object.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} can't be read: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} can't be read: it is no JSON object")
+    return content
+
+
 def _whole_number(low: int, high: float = math.inf) -> Callable[[str], int]:
     """Return an argparse type: whole numbers in a range, also written 2e6 or 2_000_000."""
 
@@ -70,7 +85,10 @@ def _absolute(path: str) -> str:
         raise argparse.ArgumentTypeError("an empty path; give the folder of a checkpoint, or of a trial")
     if is_url(path):
         raise argparse.ArgumentTypeError(f"{path} is a URL; copy the checkpoint to a folder that all machines see")
-    return str(Path(path).expanduser().resolve())
+    try:
+        return str(local(path).resolve())
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _place(text: str) -> Path | str:
@@ -254,23 +272,27 @@ def parse(
 
     place = args.results_dir or Path("results") / (f"{name}-quick" if args.quick else name)
     storage = None
-    if isinstance(place, str):
-        try:
+    try:
+        if isinstance(place, str):
             storage = Storage(place)
             storage.pull()
-        except ValueError as error:
-            parser.error(str(error))
-        results_dir = storage.folder
-    else:
-        place = results_dir = place.expanduser().resolve()
+            results_dir = storage.folder
+        else:
+            place = results_dir = local(place).resolve()
+    except ValueError as error:
+        parser.error(str(error) if isinstance(place, str) else f"--results-dir: {error}")
     if results_dir.exists() and not results_dir.is_dir():
         parser.error(f"--results-dir: {results_dir} is not a folder")
     args.resume = args.resume or bool(args.add_seeds or args.add_algos)
     if args.resume:
         if not has_started(results_dir) or not (results_dir / _FILE).is_file():
-            parser.error(f"there is nothing to resume in {place}: leave --resume out, or correct --results-dir")
-        stored = json.loads((results_dir / _FILE).read_text())
-        if (other := stored.pop("experiment")) != name:
+            quick = "" if args.quick or args.results_dir else ", or add --quick if that was a quick run"
+            parser.error(f"there is nothing to resume in {place}: leave --resume out, or correct --results-dir{quick}")
+        try:
+            stored = read_object(results_dir / _FILE)
+        except ValueError as error:
+            parser.error(str(error))
+        if (other := stored.pop("experiment", None)) != name:
             parser.error(f"{place} holds a run of {other}, not of {name}: correct --results-dir")
         args = _with_stored_settings(parser, argv, {"lengthened_to": None, **stored})
     elif has_started(results_dir):

@@ -96,12 +96,12 @@ def check_row(name: str, row: Mapping[str, Any]) -> None:
     """
     if not isinstance(row, Mapping):
         raise ValueError(f"Row {name!r}: {row!r} is illegal; legal: a mapping of settings.")
-    if name != file_name(name):
+    if not isinstance(name, str) or name != file_name(name):
         raise ValueError(
             f"Row {name!r}: folders of trials are named after it; legal are letters, digits and . _ + - (no dot first)."
         )
     algorithm = row.get("algorithm", "")
-    if algorithm not in maobs.ALGORITHMS:
+    if not isinstance(algorithm, str) or algorithm not in maobs.ALGORITHMS:
         legal = ", ".join(maobs.ALGORITHMS)
         raise ValueError(f"Row {name!r}: unknown algorithm {algorithm!r}; legal are {legal}.")
     training = _training_arguments(maobs.ALGORITHMS[algorithm])

@@ -121,8 +121,10 @@ class Experiment:
     def __post_init__(self) -> None:
         for name, hint in _LEGAL.items():
             check_value(getattr(self, name), hint, name, "Experiment")
-        if not self.name or Path(self.name).name != self.name:
+        if Path(self.name).name != self.name or self.name in ("", "..") or not self.name.isprintable():
             raise ValueError(f"Experiment: name={self.name!r} is illegal; legal is a name of a folder.")
+        if unnamed := [n for n in (*self.algorithms, *self.variants, *self.quick_algorithms) if not isinstance(n, str)]:
+            raise ValueError(f"Experiment: {unnamed[0]!r} is no name of an algorithm or a row; legal are strings.")
         if len(set(self.algorithms)) < max(1, len(self.algorithms)):
             raise ValueError(f"Experiment: algorithms={self.algorithms} are illegal; legal are one or more, once each.")
         if unused := [name for name in self.variants if name not in self.algorithms]:
@@ -426,6 +428,7 @@ def _start_ray(args: Namespace) -> bool:
         address="local",
         num_cpus=args.workers * (1 + args.num_env_runners),
         include_dashboard=args.dashboard,
+        dashboard_host="127.0.0.1",  # who reaches it can run programs here
         log_to_driver=False,
         logging_level=logging.ERROR,
     )

@@ -23,6 +23,7 @@ from typing import Any
 from rllib_maobs.envs import SCENARIOS
 from rllib_maobs.evaluate import Task, baselines_of, evaluated, jobs_of
 from rllib_maobs.experiment.report import SCORE
+from rllib_maobs.paths import local
 from rllib_maobs.report.episodes import best_and_median, record_episode
 from rllib_maobs.report.results import Section, read_results
 
@@ -44,13 +45,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--force", action="store_true", help="replace the file if there is one")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes to watch (default: 0)")
     args = parser.parse_args(arguments)
-    # Not resolved: the page calls results what the user calls them.
-    folders = list(dict.fromkeys(Path(os.path.abspath(folder.expanduser())) for folder in args.folders))
     try:
+        # Not resolved: the page calls results what the user calls them.
+        folders = list(dict.fromkeys(Path(os.path.abspath(local(folder))) for folder in args.folders))
         if find_spec("bokeh") is None:
             raise ValueError('the report needs bokeh: pip install "rllib-maobs[report]"')
         sections, notes = read_results(folders)
-        output = (args.output or folders[0] / OUTPUT).expanduser().resolve()
+        output = local(args.output or folders[0] / OUTPUT).resolve()
         check_output(output, force=args.force)
     except ValueError as error:
         parser.error(str(error))

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from rllib_maobs.envs import SCENARIOS, make_scenario
+from rllib_maobs.experiment.arguments import read_object
 from rllib_maobs.experiment.report import LABELS, LAST, LAST_QUICK, SCORE, load_curves
 
 # How an agent is moved and what critics see: the task is the same, and so are its scores.
@@ -152,14 +153,14 @@ def _read_folder(folder: Path) -> tuple[list[Trial], set[str]]:
     experiment = folder / "experiment.json"
     try:
         curves = load_curves(folder)
-    except (FileNotFoundError, KeyError, TypeError):
+    except (OSError, LookupError, TypeError, ValueError, AttributeError):  # nothing is there, or something else
         if experiment.is_file():
             raise ValueError(f"{str(folder)!r} has no evaluation yet: try again later") from None
         raise ValueError(
             f"{str(folder)!r} is no results folder; legal: what a program in tuned_examples/ wrote to, with a folder "
             f"for each trial that holds its result.json"
         ) from None
-    plan = json.loads(experiment.read_text()) if experiment.is_file() else {}
+    plan = read_object(experiment) if experiment.is_file() else {}
     planned = {f"{algorithm}-seed{seed}" for algorithm in plan.get("algos", []) for seed in plan.get("seeds", [])}
     trials = []
     for name, curve in curves.groupby("trial", sort=False):

@@ -6,6 +6,7 @@ from typing import Any
 
 import ray.rllib
 from hypothesis import given
+from hypothesis import settings as examples
 from hypothesis import strategies as st
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 
@@ -15,6 +16,7 @@ from rllib_maobs.registry import same
 from tests.conftest import ALGORITHMS, small_config
 from tests.faults.fuzz import PACKAGE, little_memory, names_like, nasty, refused
 
+FEW = examples(max_examples=min(250, examples.default.max_examples))  # each of them is validated, which takes a while
 SOURCES = (PACKAGE, ray.rllib.__path__[0])  # RLlib has sentences of its own
 OURS = sorted({*maobs.JointConfig.legal, "actor", "actor_settings", "critic", "critic_settings", "exploration"})
 METHODS = {method: settings.settings_of_method(method) for method in settings.METHODS}
@@ -55,6 +57,7 @@ def check(config: maobs.JointConfig, change: Any, tally: Counter[str]) -> None:
             assert config.copy(copy_frozen=False).num_env_runners >= 0
 
 
+@FEW
 @given(data=st.data(), algorithm=st.sampled_from(ALGORITHMS), method=st.sampled_from(sorted(METHODS)))
 def test_settings_by_method(data: Any, algorithm: str, method: str, tally: Counter[str]) -> None:
     config = small_config(algorithm)
@@ -64,6 +67,7 @@ def test_settings_by_method(data: Any, algorithm: str, method: str, tally: Count
     check(config, lambda: getattr(config, method)(**given), tally)
 
 
+@FEW
 @given(data=st.data(), algorithm=st.sampled_from(ALGORITHMS))
 def test_settings_of_ours(data: Any, algorithm: str, tally: Counter[str]) -> None:
     config = small_config(algorithm)
@@ -75,6 +79,7 @@ def test_settings_of_ours(data: Any, algorithm: str, tally: Counter[str]) -> Non
     check(config, lambda: config.training(**legal), tally)
 
 
+@FEW
 @given(data=st.data(), algorithm=st.sampled_from(ALGORITHMS))
 def test_settings_by_a_dict(data: Any, algorithm: str, tally: Counter[str]) -> None:
     """As Tune gives them, or a user's file."""
@@ -84,6 +89,7 @@ def test_settings_by_a_dict(data: Any, algorithm: str, tally: Counter[str]) -> N
     check(config, lambda: config.update_from_dict(changes), tally)
 
 
+@FEW
 @given(
     env=st.one_of(ENVS, nasty()), options=st.one_of(nasty(), st.dictionaries(st.text(max_size=9), nasty(), max_size=2))
 )

@@ -119,8 +119,13 @@ class VectorMachine(RuleBasedStateMachine):
         return (scale * self.rng.uniform(-1, 1, (E, agents, *space.shape))).astype(self.rng.choice([np.float32, float]))
 
     @precondition(lambda self: self.begun and self.running.all())
-    @rule(odd=st.integers(0, 2))
-    def step(self, odd: int) -> None:
+    @rule(odd=st.integers(0, 2), count=st.integers(1, 5))
+    def step(self, odd: int, count: int) -> None:
+        for _ in range(count):
+            if self.running.all():
+                self.step_once(odd)
+
+    def step_once(self, odd: int) -> None:
         actions = self.actions()
         before = actions.copy()
         given = np.asfortranarray(actions) if odd == 1 else actions
@@ -184,9 +189,7 @@ class VectorMachine(RuleBasedStateMachine):
 
 def test_copies_are_what_single_ones_are(long: bool, tally: Counter[str]) -> None:
     machine = type("Machine", (VectorMachine,), {"tally": tally})
-    run_state_machine_as_test(
-        machine, settings=settings(max_examples=300 if long else 15, stateful_step_count=40 if long else 20)
-    )
+    run_state_machine_as_test(machine, settings=settings(max_examples=300 if long else 30, stateful_step_count=40))
 
 
 @given(num_envs=nasty().filter(lambda value: not isinstance(value, int) or not 10_000 < value < 2**40))
