@@ -209,7 +209,7 @@ def test_remote_runners_that_hang(ray_session: None, tmp_path: Path, long: bool)
     try:
         start = time.monotonic()
         result = algo.train()
-        assert result["num_env_steps_sampled_lifetime"] == algo._progress["env_steps"] == len(algo.replay_buffer) == 40
+        assert result["num_env_steps_sampled_lifetime"] == algo._progress["env_steps"] == 40
         assert time.monotonic() - start < 60
     finally:
         algo.stop()
