@@ -280,9 +280,10 @@ class JointConfig(AlgorithmConfig):
     @override(AlgorithmConfig)
     def update_from_dict(self, config_dict: dict[str, Any]) -> Self:
         """Changes settings, e.g. by Tune's `param_space`, whichever of their names in RLlib they are given by."""
-        if not isinstance(config_dict, Mapping) or not all(isinstance(name, str) for name in config_dict):
+        named = isinstance(config_dict, Mapping) and all(isinstance(name, str) for name in config_dict)
+        if not named and not isinstance(config_dict, AlgorithmConfig):
             raise ValueError(f"A configuration is changed by a dict of settings by name, not {config_dict!r}.")
-        for name in config_dict:
+        for name in config_dict if named else ():
             settings.check_is_no_part(self, name)
         with _as_before_if_refused(self):
             super().update_from_dict(settings.as_attributes(config_dict))
