@@ -132,11 +132,11 @@ def sealed(content: bytes) -> bytes:
 
 def _check_whole(path: Path, content: bytes) -> None:
     """Raise a ValueError for a file that is not as it was written; those without a checksum are not checked."""
-    place = _SEAL.search(content)
-    if place is None:
+    if CHECKSUM.encode() not in content:
         return
-    unsealed = content[: place.start(1)] + UNSEALED.encode() + content[place.end(1) :]
-    if zlib.crc32(unsealed) != int(place.group(1), 16):
+    place = _SEAL.search(content)
+    unsealed = content[: place.start(1)] + UNSEALED.encode() + content[place.end(1) :] if place else b""
+    if place is None or zlib.crc32(unsealed) != int(place.group(1), 16):
         raise ValueError(f"{str(path)!r} is damaged: it is not as it was written, says its checksum")
 
 
@@ -212,7 +212,11 @@ def read_exported(
     description = _parsed(path, metadata)
     try:
         if path.suffix.lower() == ".onnx":
-            return description, {name: OnnxActor(content, description, name) for name in description.actors}
+            actors: dict[str, AgentModule | OnnxActor] = {}
+            for name in description.actors:
+                actors[name] = actor_of_file = OnnxActor(content, description, name)
+                actor_of_file.check()
+            return description, actors
         return description, {name: _module(description, name, content, actor) for name in description.actors}
     except Exception as error:  # whatever networks say to settings that are a stranger's
         raise ValueError(f"{str(path)!r} can't be read: {error}") from error
@@ -250,6 +254,12 @@ class OnnxActor:
             for key, shape in {**each.inputs, **each.state}.items()
             if other != name
         }
+
+    def check(self) -> None:
+        """Act once, whatever ONNX Runtime then raises; raise a ValueError if that is no action of its space."""
+        action, _ = self.act(np.zeros((2, *self.observation_space.shape), np.float32))
+        if np.shape(action) != (2, *(self.action_space.shape or ())):
+            raise ValueError(f"its network acts by an array {np.shape(action)} in {self.action_space}")
 
     @property
     def _free(self) -> bool:
