@@ -370,9 +370,8 @@ def test_compiled_code_keeps_the_python_values_that_a_loss_read(ray_session: Non
     ],
 )
 def test_what_does_not_fit_is_refused(ray_session: None, change: dict[str, Any], message: str) -> None:
-    config = maobs.MADDPGConfig().environment("maobs/spread-3a").training(**change)
     with pytest.raises(ValueError, match=message):
-        config.build_algo()
+        maobs.MADDPGConfig().environment("maobs/spread-3a").training(**change).build_algo()
 
 
 def test_what_is_not_defined_is_refused(ray_session: None) -> None:

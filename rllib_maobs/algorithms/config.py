@@ -283,10 +283,11 @@ class JointConfig(AlgorithmConfig):
         named = isinstance(config_dict, Mapping) and all(isinstance(name, str) for name in config_dict)
         if not named and not isinstance(config_dict, AlgorithmConfig):
             raise ValueError(f"A configuration is changed by a dict of settings by name, not {config_dict!r}.")
-        for name in config_dict if named else ():
-            settings.check_is_no_part(self, name)
+        changes = settings.as_attributes(config_dict)
+        for name in changes if named else ():  # RLlib has older names of some, such as "callbacks"
+            settings.check_is_no_part(self, self._translate_special_keys(name, warn_deprecated=False))
         with _as_before_if_refused(self):
-            super().update_from_dict(settings.as_attributes(config_dict))
+            super().update_from_dict(changes)
         return self
 
     # RLlib's methods that set settings.

@@ -112,3 +112,12 @@ def test_a_refused_call_changes_nothing() -> None:
     ):
         assert refused(change) is not None
         assert same(contents(config), before)
+
+
+def test_a_whole_configuration_is_taken() -> None:
+    """As itself, and as the dict that RLlib makes of it, which has older names for some settings."""
+    whole = small_config("qmix").training(gamma=0.5)
+    for form in (whole, whole.to_dict()):
+        config = maobs.QMIXConfig().update_from_dict(form)
+        config.validate()
+        assert config.gamma == 0.5 and config.env_config == whole.env_config
