@@ -213,9 +213,9 @@ def test_rewards_that_differ_later_are_found_when_they_do(ray_session: None) -> 
     ],
 )
 def test_wrong_settings_of_facmac_are_refused(ray_session: None, settings: dict[str, Any], message: str) -> None:
-    config = maobs.FACMACConfig().environment("maobs/spread-3a").training(**settings)
+    config = maobs.FACMACConfig().environment("maobs/spread-3a")
     with pytest.raises(ValueError, match=message):
-        config.build_algo()
+        config.training(**settings).build_algo()
 
 
 def test_the_docs_show_what_the_algorithms_declare() -> None:

@@ -230,6 +230,7 @@ def test_options_of_stock_ppo_and_of_foreign_environments(tmp_path):
     def checkpoint(name, **config):
         (tmp_path / name / "learner_group" / "learner" / "rl_module").mkdir(parents=True)
         arguments = {"ctor_args_and_kwargs": (({"evaluation_config": None, **config},), {})}
+        (tmp_path / name / "rllib_checkpoint.json").write_text("{}")
         (tmp_path / name / "class_and_ctor_args.pkl").write_bytes(pickle.dumps(arguments))
         return str(tmp_path / name)
 

@@ -435,7 +435,8 @@ class JointAlgorithm(AnyPath, Algorithm):
         if COMPONENT_LEARNER_GROUP in state:
             self._send_weights()
         if "progress" in state:
-            self._progress = {"largest_reward": 0.0, **state["progress"]}
+            self._progress = dict(state["progress"])
+            self._progress.setdefault("largest_reward", 0.0)
             self._owe_from_now_on()
             for group in (self.env_runner_group, self.eval_env_runner_group):
                 if group is not None and group.num_remote_workers() > 0:  # their episodes are in no checkpoint

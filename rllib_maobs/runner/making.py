@@ -27,7 +27,8 @@ def env_creator(config: AlgorithmConfig) -> Any:
     register_envs()  # names are lost when Ray restarts
     if isinstance(config.env, type) and hasattr(config.env, "reset") and hasattr(config.env, "step"):
         return config.env
-    if isinstance(config.env, str) and _global_registry.contains(ENV_CREATOR, config.env):
+    # Ray's registry holds names of ASCII alone.
+    if isinstance(config.env, str) and config.env.isascii() and _global_registry.contains(ENV_CREATOR, config.env):
         return _global_registry.get(ENV_CREATOR, config.env)
     hint = closest(config.env, register_envs()) if isinstance(config.env, str) else ""
     raise ValueError(
