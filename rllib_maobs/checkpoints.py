@@ -33,7 +33,11 @@ def find_checkpoint(path: str | Path) -> Path:
     if not str(path):  # which would be the present folder
         raise ValueError("'' is no checkpoint; legal: the folder of a checkpoint, or of a trial with checkpoints.")
     folder = local(path).resolve()
-    candidates = with_those_before(folder) if (folder / METADATA).exists() else numbered(folder)
+    # Of a checkpoint anything may be missing, of one that was being replaced all of it.
+    itself = (folder / METADATA).exists() or folder.joinpath(*_MODULES[:1]).is_dir() or not folder.exists()
+    candidates = with_those_before(folder) if itself else numbered(folder)
+    if not any(path.exists() for path in candidates):
+        candidates = []
     if candidates and (found := first_whole(*candidates)).joinpath(*_MODULES).is_dir():
         return found
     trials = sorted({str(trial.parent.name) for trial in folder.glob("*/checkpoint_*")}) if folder.is_dir() else []

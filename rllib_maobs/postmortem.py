@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import zipfile
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from rllib_maobs.learner.health import REPORT
 
 MOST_EXTREME = 3  # rows shown of each array
+ABOUT = {"what", "algorithm", "agents", "policies", "update", "gamma", "reward_scale", "learning_rates"}
+"""What a file says of itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -60,10 +62,11 @@ def read(path: str | Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays.pop("about")))
-        if arrays["report"].shape == (len(REPORT), len(about["agents"])):
-            return about, arrays
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile):
-        pass
+        whole = about.keys() >= ABOUT and arrays["report"].shape == (len(REPORT), len(about["agents"]))
+    except Exception:  # what is damaged may raise anything, of the archive, its compression, and what is in it
+        whole = False
+    if whole:
+        return about, arrays
     raise ValueError(f"{str(path)!r} is no whole post-mortem; legal: a file postmortem-....npz that training has left.")
 
 
@@ -102,3 +105,7 @@ def _line(name: str, array: NDArray[Any]) -> str:
     extreme = ", ".join(f"{list(place)}: {array[place]:.4g}" for place in places)
     median = f"median {np.median(flat[np.isfinite(flat)]):.3g}, " if bad < flat.size else ""
     return f"  {name} {array.shape}: {f'{bad} not finite, ' if bad else ''}{median}largest {extreme}"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -494,7 +494,7 @@ class JointReplayBuffer(Checkpointable):
             legal &= all(link.shape == (held,) and link.dtype == np.int64 for link in links) and head >= 0
             legal &= all(_is_count(place, _NONE) and _is_count(start, 0) for place, start in tails.values())
             legal &= all((_NONE <= link).all() and (link < head).all() for link in links)
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
             raise ValueError(f"The saved replay buffer is damaged ({type(error).__name__}: {error}).") from error
         if not legal:
             raise ValueError("The saved replay buffer is damaged: its columns and links do not belong together.")

@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import shutil
 import zlib
 from collections.abc import Iterator
@@ -122,7 +123,7 @@ def numbered(trial: Path) -> list[Path]:
 
 
 def _is_numbered(path: Path) -> bool:
-    return path.name.startswith("checkpoint_") and path.is_dir()
+    return re.fullmatch(r"checkpoint_\d+", path.name) is not None and path.is_dir()
 
 
 @contextlib.contextmanager

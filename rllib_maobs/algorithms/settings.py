@@ -523,6 +523,8 @@ def unknown(config: JointConfig, name: str) -> str:
 
     owners = [other for other, cls in ALGORITHMS.items() if name in cls.legal]
     legal = [legal for legal in (*vars(type(config)()), *config.legal) if legal[0] != "_"]
+    if config.name in owners:
+        return f"{name} is given by training({name}=...)."
     hint = f"; it is one of {', '.join(owners)}" if owners else closest(name, legal)
     return f"{type(config).__name__} has no setting {name!r}{hint}."
 

@@ -171,6 +171,8 @@ def find_unfit(checkpoint: Path) -> str | None:
         return None  # of a revision that wrote none, and kept no logs
     if not (checkpoint / LOGS).is_dir():
         return "its logs are missing"
+    if not (checkpoint / LOGS / CHECKSUMS).exists():
+        return f"{LOGS}/{CHECKSUMS} is missing"
     fault = find_fault(checkpoint / LOGS)
     return fault and f"{LOGS}/{fault}"
 

@@ -30,6 +30,10 @@ class Preemption(tune.Callback):
         self._saved = set[str]()
         self._reported = set[str]()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What Tune saves of it: not what a program has done at SIGTERM before."""
+        return {**vars(self), "_before": None}
+
     def __enter__(self) -> Self:
         try:
             self._before = signal.signal(signal.SIGTERM, self._on_sigterm)

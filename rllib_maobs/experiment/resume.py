@@ -119,6 +119,7 @@ def _take_up_trial(trial: Any, folder: Path, kept: int) -> bool:
     found, unfit = numbered(folder), list[tuple[Path, str]]()
     while found and (fault := find_unfit(found[0])):
         unfit.append((found.pop(0), fault))
+    found = [*found[:1], *(path for path in found[1:] if find_unfit(path) is None)]
     finished = trial.status == TuneTrial.TERMINATED
     if found:
         then = f"the one before it is used: {found[0].name}"

@@ -27,6 +27,8 @@ from rllib_maobs.experiment.trial import Trial, TrialSpec
 
 # The last one, and the one before it, should that be damaged.
 KEPT = 2
+# At a URL Tune's state is some minutes old when a run is killed: what it names must still be there.
+KEPT_AT_URL = 10
 
 
 def start(
@@ -52,7 +54,7 @@ def start(
     run_config = tune.RunConfig(
         name=args.results_dir.name,
         storage_path=_storage_path(args),
-        checkpoint_config=_checkpoints(),
+        checkpoint_config=_checkpoints(args),
         progress_reporter=_progress(args),
         callbacks=[*callbacks, Retries(args.max_failures), *make_callbacks(name, args)],
         verbose=1,
@@ -108,7 +110,7 @@ def resume(
         config=_grid(others) if others else {},
         num_samples=args.num_samples if search else 1,
         storage_path=_storage_path(args),
-        checkpoint_config=_checkpoints(),
+        checkpoint_config=_checkpoints(args),
         trial_name_creator=_trial_name,
         trial_dirname_creator=_trial_name,
     )
@@ -157,8 +159,9 @@ def _scheduler(search: Search | None, specs: Sequence[TrialSpec]) -> Any:
     return stopping(max(spec.stop_timesteps for spec in specs)) if search else None
 
 
-def _checkpoints() -> tune.CheckpointConfig:
-    return tune.CheckpointConfig(checkpoint_at_end=True, num_to_keep=KEPT)  # and whenever a trial asks for one
+def _checkpoints(args: Namespace) -> tune.CheckpointConfig:
+    kept = KEPT_AT_URL if args.storage else KEPT
+    return tune.CheckpointConfig(checkpoint_at_end=True, num_to_keep=kept)  # and whenever a trial asks for one
 
 
 def _progress(args: Namespace) -> ProgressTable:

@@ -1,7 +1,10 @@
 """Updates that are not finite end training or are skipped, and leave what a post-mortem needs; values are watched."""
 
+import contextlib
 import logging
 import math
+import runpy
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,7 +48,7 @@ def many(*batches: Batch) -> Batch:
 
 
 def test_training_that_diverges_leaves_a_post_mortem(
-    ray_session: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ray_session: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     algo = small_config("maddpg").training(reward_scale=1e25).build_algo()
     try:
@@ -70,7 +73,15 @@ def test_training_that_diverges_leaves_a_post_mortem(
     rewards = arrays["batch/rewards"]
     row, agent = map(int, np.unravel_index(np.abs(rewards).argmax(), rewards.shape))
     assert f"largest [{row}, {agent}]: {rewards[row, agent]:.4g}, [" in shown
-    path.write_bytes(path.read_bytes()[:-100])
+    monkeypatch.setattr(sys, "argv", ["postmortem", str(path)])
+    runpy.run_module("rllib_maobs.postmortem", run_name="__main__")
+    assert capsys.readouterr().out == shown
+    whole = path.read_bytes()
+    for place in range(0, len(whole), len(whole) // 60):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        with contextlib.suppress(ValueError):  # a bit of the archive's own notes may not matter
+            assert len(list(postmortem.shown(*postmortem.read(path)))) > 10
+    path.write_bytes(whole[:-100])
     for wrong in (path, tmp_path, tmp_path / "none.npz"):
         with pytest.raises(ValueError, match="is no whole post-mortem; legal: a file postmortem"):
             postmortem.read(wrong)

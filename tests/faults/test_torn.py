@@ -113,6 +113,18 @@ def test_the_one_before_takes_its_place(saved: SimpleNamespace, trial: Path, cap
     again.stop()
 
 
+def test_the_one_before_is_found_whatever_is_missing(trial: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Also the file that makes it a checkpoint, or all of it: it was being replaced when the program died."""
+    shutil.copytree(trial / "checkpoint_000001", trial / "checkpoint_backup")  # a user's own copy
+    assert numbered(trial)[0].name == "checkpoint_000002"
+    newest = trial / "checkpoint_000002"
+    (newest / METADATA).unlink()
+    assert find_checkpoint(newest).name == "checkpoint_000001"
+    assert f"{METADATA} is missing" in caplog.text
+    shutil.move(trial / "checkpoint_000001", trial / ".mine.before")
+    assert find_checkpoint(trial / "mine").name == ".mine.before"
+
+
 def test_where_there_is_none_before_it_an_error_says_so(saved: SimpleNamespace, trial: Path) -> None:
     first = trial / "checkpoint_000000"
     flip(first / "replay_buffer" / "state.pkl", 800)
