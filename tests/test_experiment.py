@@ -724,7 +724,8 @@ def test_scripts_have_a_row_that_learns_in_minutes(script: str, agents: int) -> 
     config.validate()
     assert (tuned.stop_timesteps, config.num_envs_per_env_runner) == (steps, 32)
     assert (config.name, config.actor, config.critic, config.critic_state) == ("maddpg", "entity", "entity", "world")
-    assert config.module_ids == ("all",) * agents
+    shared = row.get("one_policy", False)  # targets are not in the walled tunnels, and with them policies
+    assert config.module_ids == (("all",) * agents if shared else tuple(f"agent_{i}" for i in range(agents)))
     assert config.critic_lr == [[0, 1e-3], [steps // 2, 1e-3], [steps, 5e-5]]
     stricter = row.get("train_env_config", {})
     assert config.env_config == {"action_mode": "force", "horizon": row["train_horizon"], **stricter}
