@@ -9,21 +9,20 @@ Agents' rewards differ here, and FACMAC learns the value of one team reward: it 
 Before it starts, the full run measures how fast it is on this machine, and says how long it will take.
 """
 
-from rllib_maobs.experiment import Experiment, decayed, fading
+from rllib_maobs.experiment import Experiment, decayed
 
 experiment = Experiment(
     name="simple-tunnel-6a",
     env="maobs/simple-tunnel-6a",
     algorithms=("maddpg-entity", "iddpg", "maddpg", "maddpg-lstm", "maddpg-l"),
     variants={
-        # Not in the paper: networks that see sets of entities, shared by all agents.
+        # Not in the paper: networks that see sets of entities; a policy for each agent, as in simple_tunnel.py.
         "maddpg-entity": {
             "algorithm": "maddpg",
             "actor": "entity",
             "critic": "entity",
             "critic_state": "world",
             "other_agents_actions": "joint",
-            "one_policy": True,
             "actor_lr": decayed(5e-4),
             "critic_lr": decayed(1e-3),
             "gamma": 0.95,
@@ -32,7 +31,7 @@ experiment = Experiment(
             "updates_per_env_step": 1 / 2,
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
-            "exploration": fading(epsilon=0.1, noise=0.2, final=0.1),
+            "exploration": {"epsilon": 0.1, "noise": 0.2, "decay": 1e-6, "final": 0.1},
             "env_config": {"action_mode": "force"},
             "train_horizon": 60,  # the way through the tunnel is long
             "num_envs_per_env_runner": 32,
