@@ -91,7 +91,7 @@ def test_many_updates_are_those_of_the_cpu(monkeypatch: pytest.MonkeyPatch, how:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_trains_there_and_its_agents_act_anywhere(tmp_path: Path, algorithm: str) -> None:
-    """Replay, networks and Adam are there, acting is not; a checkpoint goes on on the CPU and on the GPU."""
+    """Replay, networks and Adam are there; a checkpoint goes on on the CPU and on the GPU."""
 
     def build(device: str) -> Any:
         return small_config(algorithm).learners(num_gpus_per_learner=int(device == "cuda")).build_algo()
@@ -100,7 +100,6 @@ def test_trains_there_and_its_agents_act_anywhere(tmp_path: Path, algorithm: str
     for _ in range(4):
         algo.train()
     assert algo._learner.device.type == algo.replay_buffer.sample((4,), gamma=0.9).rewards.device.type == "cuda"
-    assert all(parameter.device.type == "cpu" for parameter in algo.env_runner.module["agent_0"].parameters())
     algo.save_to_path(tmp_path)
     for device in ("cpu", "cuda"):
         other = build(device)

@@ -35,7 +35,7 @@ experiment = Experiment(
             "env_config": {"action_mode": "force"},
             "train_horizon": 60,  # the way through the tunnel is long
             "num_envs_per_env_runner": 32,
-            "stop_timesteps": 200_000,
+            "stop_timesteps": 100_000,
             "quick": {
                 "stop_timesteps": 30_000,
                 "steps_per_iteration": 4_000,
