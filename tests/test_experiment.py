@@ -11,6 +11,7 @@ import sys
 import time
 import tomllib
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -637,6 +638,26 @@ def test_what_an_experiment_cannot_be(change: dict[str, Any], message: str) -> N
         replace(EXPERIMENT, **change)
 
 
+@pytest.mark.parametrize(("script", "agents", "batch"), [("spread3a_networks", 3, 128), ("spread9a_networks", 9, 64)])
+def test_networks_are_compared_on_equal_terms(script: str, agents: int, batch: int) -> None:
+    experiment = load_script(script).experiment
+    specs = experiment.specs(parsed(experiment, "--seeds", "0"))
+    assert len(specs) == 18
+    networks = Counter[tuple[str, str]]()
+    for spec in specs:
+        config = spec.build_config()
+        config.validate()
+        assert (len(config.team.agents), config.train_batch_size_per_learner) == (agents, batch)
+        assert (config.updates_per_env_step, config.num_envs_per_env_runner, len(set(config.module_ids))) == (
+            1 / 8,
+            32,
+            1,
+        )
+        assert spec.stop_timesteps == experiment.stop_timesteps
+        networks[config.actor, config.critic] += 1
+    assert networks == {("mlp", "mlp"): 6, ("lstm", "mlp"): 6, ("entity", "entity"): 6}
+
+
 def test_quick_algorithms_are_some_of_all() -> None:
     with pytest.raises(ValueError, match="Unknown quick_algorithms 'facmac'; legal are those of algorithms: iddpg, ma"):
         replace(EXPERIMENT, quick_algorithms=("iddpg", "facmac"))
@@ -652,7 +673,9 @@ def load_script(script: str | Path) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(path.parent)  # where Python finds what a script imports from its neighbours
+        spec.loader.exec_module(module)
     return module
 
 
