@@ -148,19 +148,28 @@ def test_checkpoints_are_filmed_on_request(
     assert "at 200 env steps: no space" in capsys.readouterr().out
 
 
-def test_other_loggers_get_the_same_curves() -> None:
-    logged = []
+def test_other_loggers_get_the_same_curves_and_films(trial: SimpleNamespace, tmp_path: Path) -> None:
+    logged: list[Any] = []
 
     class Logger:
         def log_trial_result(self, iteration: int, trial: Any, result: dict[str, Any]) -> None:
             logged.append((iteration, trial, result))
 
-    class Grouped(_Grouped, Logger):
-        pass
+        def log_trial_save(self, trial: Any) -> None:
+            logged.append(trial)
 
-    Grouped().log_trial_result(3, "trial", result(200))
-    steps = {"env_steps": 200, "timesteps_total": 200, "training_iteration": 3}
-    assert logged == [(3, "trial", {**curves_of(result(200)), **steps})]
+    class Grouped(_Grouped, Logger):
+        def log_film(self, *film: Any) -> None:
+            logged.append(film)
+
+    board = Grouped()
+    board.log_trial_result(3, trial, result(200))
+    board.log_trial_save(trial)  # there is no film
+    (tmp_path / "episode-200.gif").touch()
+    board.log_trial_save(trial)
+    steps = {"env_steps": 200, "timesteps_total": 200, "training_iteration": 200}
+    film = (trial, tmp_path / "episode-200.gif", 200)
+    assert logged == [(3, trial, {**curves_of(result(200)), **steps}), trial, trial, film]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +204,7 @@ def test_weights_and_biases_works_offline(
     pytest.importorskip("wandb")
     mlflow = pytest.importorskip("mlflow")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    given = ["--results-dir", str(tmp_path / "new"), "--wandb", "--mlflow", "--algos", "maddpg", "--quick"]
+    given = ["--results-dir", str(tmp_path / "new"), "--wandb", "--mlflow", "--video", "--algos", "maddpg", "--quick"]
     small = {"num_random_steps": 16, "num_steps_sampled_before_learning_starts": 16, "num_envs_per_env_runner": 4}
     quick = {"stop_timesteps": 24, "steps_per_iteration": 24, "evaluation_duration": 1}
     row = {"algorithm": "maddpg", **small, "train_batch_size_per_learner": 8, "quick": quick}
@@ -208,3 +217,7 @@ def test_weights_and_biases_works_offline(
     (run,) = client.search_runs([experiment.experiment_id])
     (point,) = client.get_metric_history(run.info.run_id, "evaluation/score")
     assert point.step == 24 and run.data.params["algorithm"] == "maddpg"
+    (film,) = (tmp_path / "new" / "wandb").glob("offline-run-*/files/media/videos/episode_24_*.gif")
+    (artifact,) = client.list_artifacts(run.info.run_id, "episodes")
+    assert artifact.path == "episodes/episode-24.gif" and artifact.file_size == film.stat().st_size > 0
+    assert not Path("mlruns").exists()

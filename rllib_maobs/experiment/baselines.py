@@ -16,16 +16,16 @@ _PAIRS = 1_000_000  # of bodies, in all copies at once: some hundred megabytes
 
 
 def task_options(env: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all options of a task, without those that make no other task: `action_mode` and `state`.
+    """Return the options of a task, without those that make no other task: `action_mode` and `state`.
 
     With these baselines play, in every table: with the task's own action_mode, not with that of what they stand
     beside. So random play has one number on a task, whatever was trained there.
 
     Args:
-        env: A scenario's id.
-        options: Its options; an illegal one is a ValueError.
+        env: A scenario's id, whose options all count, also those that are not given; or another environment.
+        options: Its options; an illegal one of a scenario is a ValueError.
     """
-    every = asdict(make_scenario(env, **options).options)
+    every = asdict(make_scenario(env, **options).options) if env in SCENARIOS else options
     return {name: value for name, value in every.items() if name not in _NOT_THE_TASK}
 
 
