@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.io_wrapper import GetLogdirSubdirectories
 
 from rllib_maobs.experiment import Experiment, decayed
 from rllib_maobs.experiment import dashboards as dashboards_module
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.dashboards import TensorBoard, _Grouped, curves_of, settings_of
+from rllib_maobs.experiment.keeping import keep_logs, put_back_logs
 from rllib_maobs.experiment.report import STEPS
 from rllib_maobs.experiment.trial import TrialSpec
 
@@ -121,6 +123,22 @@ def test_tensorboard_counts_env_steps(trial: SimpleNamespace, tmp_path: Path) ->
     assert [(event.step, event.value) for event in events.Scalars("evaluation/score")] == [(100, -3.0), (200, -3.0)]
     data = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     assert b"tau" in data and b"maddpg,tau=0.25" in data
+
+
+def test_tensorboard_shows_a_trial_once(trial: SimpleNamespace, tmp_path: Path) -> None:
+    """Checkpoints hold copies of its logs, for runs that are killed: they are no runs."""
+    board, checkpoint = TensorBoard(), tmp_path / "checkpoint_000000"
+    checkpoint.mkdir()
+    board.log_trial_result(1, trial, result(100))
+    keep_logs(checkpoint, tmp_path)
+    (log,) = tmp_path.glob("*tfevents*")
+    saved = log.read_bytes()
+    board.log_trial_result(2, trial, result(200))
+    board.log_trial_end(trial)
+    assert [*GetLogdirSubdirectories(str(tmp_path))] == [str(tmp_path)]
+    assert log.read_bytes() != saved
+    put_back_logs(checkpoint, tmp_path)
+    assert [*tmp_path.glob("events*")] == [log] and log.read_bytes() == saved
 
 
 def test_checkpoints_are_filmed_on_request(
