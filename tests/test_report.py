@@ -256,6 +256,8 @@ def test_the_page_holds_the_numbers_and_fetches_nothing(page: Path) -> None:
         (["RESULTS/small", "--output", "RESULTS/page.html"], "exists: add --force to replace it"),
         (["RESULTS/small", "--output", "RESULTS"], "is a folder: give a file in it"),
         (["RESULTS/small", "--output", "RESULTS/no/page.html"], "there is no folder"),
+        (["RESULTS/small/ours-seed1"], "is a trial: give its experiment's, 'RESULTS/small'"),
+        (["RESULTS/small", "--force", "--seed", "-1"], "--seed -1 is illegal; legal: an integer >= 0"),
     ],
 )
 def test_mistakes_end_in_a_sentence(
@@ -266,7 +268,7 @@ def test_mistakes_end_in_a_sentence(
     before = page.read_bytes()
     with pytest.raises(SystemExit) as stop:
         main([argument.replace("RESULTS", str(page.parent)) for argument in arguments])
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+    assert stop.value.code == 2 and message.replace("RESULTS", str(page.parent)) in capsys.readouterr().err
     assert page.read_bytes() == before
 
 

@@ -155,6 +155,8 @@ def _read_folder(folder: Path) -> tuple[list[Trial], set[str]]:
     except (OSError, LookupError, TypeError, ValueError, AttributeError):  # nothing is there, or something else
         if experiment.is_file():
             raise ValueError(f"{str(folder)!r} has no evaluation yet: try again later") from None
+        if (folder / "result.json").is_file():
+            raise ValueError(f"{str(folder)!r} is a trial: give its experiment's, {str(folder.parent)!r}") from None
         raise ValueError(
             f"{str(folder)!r} is no results folder; legal: what a program in tuned_examples/ wrote to, with a folder "
             f"for each trial that holds its result.json"
