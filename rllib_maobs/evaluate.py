@@ -6,10 +6,10 @@
 
 CHECKPOINT is the folder of an RLlib algorithm checkpoint (of this package, or of a stock algorithm trained on
 `MAObsEnv`), or of a trial, whose last checkpoint counts, or a file of `rllib_maobs.export`. Each plays without
-exploration in the environment and with the options that its training evaluated with, unless NAME=VALUE says otherwise,
-beside random play, the scenario's heuristic and, where each agent has a target, ORCA
-(`pip install "rllib-maobs[orca]"`). Of every measure there is the mean over the episodes and a 95 % bootstrap interval
-of it.
+exploration in the environment and with the options that its training evaluated with, unless NAME=VALUE says otherwise.
+Beside them play random play, the scenario's heuristic and, where each agent has a target, ORCA
+(`pip install "rllib-maobs[orca]"`), always with the task's own action_mode. Of every measure there is the mean over the
+episodes and a 95 % bootstrap interval of it.
 """
 
 import argparse
@@ -27,10 +27,11 @@ import pandas as pd
 from scipy.stats import bootstrap
 
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
+from rllib_maobs.experiment.baselines import play_many, task_options
 from rllib_maobs.experiment.tables import format_table
 from rllib_maobs.paths import local
 from rllib_maobs.play import parse_options, play
-from rllib_maobs.policies import BASELINES, make_policy, play_episodes, saved_options, trained_on
+from rllib_maobs.policies import BASELINES, make_policy, saved_options, trained_on
 
 # What the table shows, in its order, and how; a task reports those that make sense for it.
 LABELS = {
@@ -45,8 +46,6 @@ LABELS = {
     "time_to_goal": ("steps to success", "{:.1f}"),
     "path_efficiency": ("path efficiency", "{:.2f}"),
 }
-_AT_ONCE = 100  # copies; more would be slower, for want of cache
-_PAIRS = 1_000_000  # of bodies, in all copies at once: some hundred megabytes
 
 
 class Task(NamedTuple):
@@ -88,28 +87,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--record", type=Path, metavar="FILE", help="film the best one's first episode (.gif or .mp4)")
     args = parser.parse_intermixed_args(arguments)
     pairs = [text for text in args.checkpoints if "=" in text and not os.path.exists(text)]
-    paths = list(dict.fromkeys(text for text in args.checkpoints if text not in pairs))
+    paths = [*{os.path.abspath(text): text for text in args.checkpoints if text not in pairs}.values()]
+    sizes = [*dict.fromkeys(args.num_agents)]
     files = [path for path in (args.json, args.csv, args.per_episode, args.record) if path is not None]
     try:
-        check_arguments(args.episodes, args.num_agents, files, paths, parse_options(pairs))
+        check_arguments(args.episodes, sizes, files, paths, parse_options(pairs))
         recorder = Recorder(args.record) if args.record else None
-        jobs = [
-            job for path in paths for job in jobs_of(path, args.env, args.num_agents, parse_options(pairs), args.seed)
-        ]
+        jobs = [job for path in paths for job in jobs_of(path, args.env, sizes, parse_options(pairs), args.seed)]
     except (ValueError, ImportError) as error:
         parser.error(str(error))
     names = dict(zip(paths, _short(paths), strict=True))
     rows: list[pd.DataFrame] = []
     tasks: list[Task] = []
     for path, task in jobs:
-        if task not in tasks:  # each task's baselines once, before what is to be held against them
-            tasks.append(task)
-            rows += [evaluated(task, name, args.episodes, args.seed) for name in baselines_of(task, args.baselines)]
+        untrained = Task(task.env, task_options(task.env, task.options))
+        if untrained not in tasks:  # each task's baselines once, before what is to be held against them
+            tasks.append(untrained)
+            for name in baselines_of(untrained, args.baselines):
+                rows.append(evaluated(untrained, name, args.episodes, args.seed))
         rows.append(evaluated(task, path, args.episodes, args.seed).assign(policy=names[path]))
     episodes = pd.concat(rows, ignore_index=True)
     table = summarise_episodes(episodes)
     print(to_text(table))
     print(f"\n{args.episodes} episodes each from seed {args.seed}; mean, and below it a 95 % bootstrap interval.")
+    if {*BASELINES} & {*table["policy"]}:
+        print("What is not trained acts with each task's own action_mode, and so has one number there in all tables.")
     _write(table, episodes, args)
     if recorder is not None:
         of_jobs = table.iloc[[i for i, name in enumerate(table["policy"]) if name not in BASELINES]]
@@ -229,7 +231,7 @@ def to_text(table: pd.DataFrame) -> str:
 
 
 def evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame:
-    """Play all episodes of one policy on one task, so many copies at once as are quick.
+    """Play all episodes of one policy on one task, and say so.
 
     Args:
         task: The task.
@@ -241,15 +243,9 @@ def evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame
         A row for each episode: its measures, and `env`, `agents`, `options`, `policy`.
     """
     print(f"{task.env}, {task.num_agents} agents: {policy} ...", file=sys.stderr, flush=True)
-    rows, done = [], 0
-    bodies = sum(group.count for group in make_scenario(task.env, **task.options).bodies())
-    at_once = max(1, min(_AT_ONCE, _PAIRS // bodies**2))
-    while done < episodes:
-        env = make_vec(task.env, num_envs=min(at_once, episodes - done), **task.options)
-        rows.append(play_episodes(env, make_policy(env, policy, seed + done), seed + done))
-        done += env.num_envs
+    rows = play_many(task.env, task.options, policy, episodes, seed)
     labels = {"env": task.env, "agents": task.num_agents, "options": json.dumps(task.options), "policy": policy}
-    return pd.concat(rows, ignore_index=True).assign(**labels)
+    return rows.assign(**labels)
 
 
 def baselines_of(task: Task, wanted: Sequence[str] = BASELINES) -> list[str]:

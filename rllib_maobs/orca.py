@@ -51,7 +51,8 @@ class OrcaPolicy:
         movable = [group for group in world.groups if group.movable for _ in range(group.count)]
         self._speed = np.array([_top_speed(group, world.physics) for group in movable])
         # Obstacles stay where they are for an episode, and cost more than all else: one simulator for as long.
-        self._simulators: list[tuple[FloatArray, Any] | None] = [None] * env.num_envs
+        self._simulators: list[Any] = []
+        self._obstacles: FloatArray = world.position[:, self._solid]
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         """Return actions `(E, N, A)`, or numbers `(E, N)` if they are discrete, in the environment's situation."""
@@ -65,30 +66,41 @@ class OrcaPolicy:
         away = np.sqrt((aim**2).sum(axis=-1, keepdims=True))
         speed = np.minimum(self._speed[:n, None], away / world.physics.dt)
         wanted[:, :n] = aim / np.maximum(away, 1e-9) * speed + _NUDGE * speed * self._rng.uniform(-1, 1, aim.shape)
-        safe = np.stack([self._safe(copy, wanted[copy])[:n] for copy in range(world.num_envs)])
-        return self._env.scenario.actions(thrust(world, safe))
+        return self._env.scenario.actions(thrust(world, self._safe(wanted)[:, :n]))
 
-    def _safe(self, copy: int, wanted: FloatArray) -> FloatArray:
-        """Return (M, 2), the velocities nearest to (M, 2) wanted ones that touch nothing, in one copy."""
-        world, simulator = self._env.world, self._simulator(copy)
-        movers = range(world.num_movers)
-        for k in movers:
-            simulator.set_agent_position(k, world.position[copy, k])
-            simulator.set_agent_velocity(k, world.velocity[copy, k])
-            simulator.set_agent_pref_velocity(k, wanted[k])
-        simulator.do_step()
-        return np.array([simulator.get_agent_velocity(k).to_tuple() for k in movers])
+    def _safe(self, wanted: FloatArray) -> FloatArray:
+        """Return (E, M, 2), the velocities nearest to the wanted ones that touch nothing."""
+        world, movers = self._env.world, wanted.shape[1]
+        self._renew()
+        now = np.stack([world.position[:, :movers], world.velocity[:, :movers], wanted], axis=2)  # (E, M, 3, 2)
+        safe: list[float] = []
+        for simulator, bodies in zip(self._simulators, now, strict=True):
+            # The library takes numbers one by one: Python's own are several times as quick as NumPy's.
+            for k, (position, velocity, preferred) in enumerate(bodies.tolist()):
+                simulator.set_agent_position(k, position)
+                simulator.set_agent_velocity(k, velocity)
+                simulator.set_agent_pref_velocity(k, preferred)
+            simulator.do_step()
+            for k in range(movers):
+                safe += simulator.get_agent_velocity(k).to_tuple()
+        return np.array(safe).reshape(wanted.shape)
 
-    def _simulator(self, copy: int) -> Any:
-        """Return the library's copy of one copy."""
+    def _renew(self) -> None:
+        """Make the simulators anew of copies where obstacles do not lie as they did."""
+        here = self._env.world.position[:, self._solid]
+        if not self._simulators:
+            self._simulators = [self._simulator(obstacles) for obstacles in here]
+        else:
+            for copy in np.flatnonzero((here != self._obstacles).any(axis=(1, 2))):
+                self._simulators[copy] = self._simulator(here[copy])
+        self._obstacles = here
+
+    def _simulator(self, obstacles: FloatArray) -> Any:
+        """Return the library's copy of a world with obstacles (K, 2) at these places."""
         world = self._env.world
-        here = world.position[copy, self._solid]
-        known = self._simulators[copy]
-        if known is not None and np.array_equal(known[0], here):
-            return known[1]
         simulator = self._library.RVOSimulator()
         simulator.set_time_step(world.physics.dt)
-        for center, radius in zip(here, world.radius[self._solid], strict=True):
+        for center, radius in zip(obstacles, world.radius[self._solid], strict=True):
             simulator.add_obstacle(_polygon(center, radius))
         for wall in world.walls:
             simulator.add_obstacle(_segment(np.array(wall.normal), wall.offset))
@@ -97,7 +109,6 @@ class OrcaPolicy:
         for speed, radius in zip(self._speed, world.radius, strict=False):
             simulator.set_agent_defaults(_SIGHT, _MAX_NEIGHBORS, *look_ahead, radius + _MARGIN, speed)
             simulator.add_agent((0.0, 0.0))
-        self._simulators[copy] = here.copy(), simulator
         return simulator
 
 

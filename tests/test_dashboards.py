@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.io_wrapper import GetLogdirSubdirectories
 
 from rllib_maobs.experiment import Experiment, decayed
 from rllib_maobs.experiment import dashboards as dashboards_module
 from rllib_maobs.experiment.arguments import make_parser, parse
 from rllib_maobs.experiment.dashboards import TensorBoard, _Grouped, curves_of, settings_of
+from rllib_maobs.experiment.keeping import keep_logs, put_back_logs
 from rllib_maobs.experiment.report import STEPS
 from rllib_maobs.experiment.trial import TrialSpec
 
@@ -123,6 +125,22 @@ def test_tensorboard_counts_env_steps(trial: SimpleNamespace, tmp_path: Path) ->
     assert b"tau" in data and b"maddpg,tau=0.25" in data
 
 
+def test_tensorboard_shows_a_trial_once(trial: SimpleNamespace, tmp_path: Path) -> None:
+    """Checkpoints hold copies of its logs, for runs that are killed: they are no runs."""
+    board, checkpoint = TensorBoard(), tmp_path / "checkpoint_000000"
+    checkpoint.mkdir()
+    board.log_trial_result(1, trial, result(100))
+    keep_logs(checkpoint, tmp_path)
+    (log,) = tmp_path.glob("*tfevents*")
+    saved = log.read_bytes()
+    board.log_trial_result(2, trial, result(200))
+    board.log_trial_end(trial)
+    assert [*GetLogdirSubdirectories(str(tmp_path))] == [str(tmp_path)]
+    assert log.read_bytes() != saved
+    put_back_logs(checkpoint, tmp_path)
+    assert [*tmp_path.glob("events*")] == [log] and log.read_bytes() == saved
+
+
 def test_checkpoints_are_filmed_on_request(
     trial: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,19 +166,28 @@ def test_checkpoints_are_filmed_on_request(
     assert "at 200 env steps: no space" in capsys.readouterr().out
 
 
-def test_other_loggers_get_the_same_curves() -> None:
-    logged = []
+def test_other_loggers_get_the_same_curves_and_films(trial: SimpleNamespace, tmp_path: Path) -> None:
+    logged: list[Any] = []
 
     class Logger:
         def log_trial_result(self, iteration: int, trial: Any, result: dict[str, Any]) -> None:
             logged.append((iteration, trial, result))
 
-    class Grouped(_Grouped, Logger):
-        pass
+        def log_trial_save(self, trial: Any) -> None:
+            logged.append(trial)
 
-    Grouped().log_trial_result(3, "trial", result(200))
-    steps = {"env_steps": 200, "timesteps_total": 200, "training_iteration": 3}
-    assert logged == [(3, "trial", {**curves_of(result(200)), **steps})]
+    class Grouped(_Grouped, Logger):
+        def log_film(self, *film: Any) -> None:
+            logged.append(film)
+
+    board = Grouped()
+    board.log_trial_result(3, trial, result(200))
+    board.log_trial_save(trial)  # there is no film
+    (tmp_path / "episode-200.gif").touch()
+    board.log_trial_save(trial)
+    steps = {"env_steps": 200, "timesteps_total": 200, "training_iteration": 200}
+    film = (trial, tmp_path / "episode-200.gif", 200)
+    assert logged == [(3, trial, {**curves_of(result(200)), **steps}), trial, trial, film]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +222,7 @@ def test_weights_and_biases_works_offline(
     pytest.importorskip("wandb")
     mlflow = pytest.importorskip("mlflow")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    given = ["--results-dir", str(tmp_path / "new"), "--wandb", "--mlflow", "--algos", "maddpg", "--quick"]
+    given = ["--results-dir", str(tmp_path / "new"), "--wandb", "--mlflow", "--video", "--algos", "maddpg", "--quick"]
     small = {"num_random_steps": 16, "num_steps_sampled_before_learning_starts": 16, "num_envs_per_env_runner": 4}
     quick = {"stop_timesteps": 24, "steps_per_iteration": 24, "evaluation_duration": 1}
     row = {"algorithm": "maddpg", **small, "train_batch_size_per_learner": 8, "quick": quick}
@@ -208,3 +235,7 @@ def test_weights_and_biases_works_offline(
     (run,) = client.search_runs([experiment.experiment_id])
     (point,) = client.get_metric_history(run.info.run_id, "evaluation/score")
     assert point.step == 24 and run.data.params["algorithm"] == "maddpg"
+    (film,) = (tmp_path / "new" / "wandb").glob("offline-run-*/files/media/videos/episode_24_*.gif")
+    (artifact,) = client.list_artifacts(run.info.run_id, "episodes")
+    assert artifact.path == "episodes/episode-24.gif" and artifact.file_size == film.stat().st_size > 0
+    assert not Path("mlruns").exists()

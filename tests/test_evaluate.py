@@ -11,9 +11,11 @@ import pytest
 
 from rllib_maobs.envs import make_scenario, make_vec
 from rllib_maobs.evaluate import jobs_of, main, summarise_episodes
-from rllib_maobs.experiment.baselines import play_baselines
+from rllib_maobs.experiment.baselines import play_baselines, task_options
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 from rllib_maobs.policies import make_policy, play_episodes
+from rllib_maobs.report import __main__ as report
+from rllib_maobs.report.results import Section
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +78,40 @@ def test_a_trial_is_evaluated_as_its_training_was(trial_folder: Path, tmp_path: 
     run(trial_folder, "--episodes", 5, *flags)
     table = pd.read_csv(files[0])
     assert list(table["policy"]) == ["random", "heuristic", "orca", "maddpg-seed0"]
-    baselines = play_baselines("maobs/spread-3a", {"action_mode": "force", "horizon": 8}, episodes=5)
-    assert table["return"][1] == pytest.approx(baselines["heuristic"]["return_agent_0"], rel=1e-6)
     assert json.loads(files[1].read_text())[3]["return"] == pytest.approx(table["return"][3])
     episodes = pd.read_csv(files[2])
     assert len(episodes) == 20
     assert episodes.groupby("policy")["return"].mean()["maddpg-seed0"] == pytest.approx(table["return"][3])
     assert files[3].stat().st_size > 1000
+
+
+def test_what_is_not_trained_has_one_number_on_a_task(
+    trial_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In evaluate, in the report and in comparison.md, whatever the team beside it acts with."""
+    run(trial_folder, "--episodes", 6, "--csv", tmp_path / "table.csv")
+    assert "acts with each task's own action_mode" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "table.csv").set_index("policy")
+    assert json.loads(table["options"]["maddpg-seed0"])["action_mode"] == "force"
+    assert "action_mode" not in json.loads(table["options"]["random"])
+    monkeypatch.setattr(report, "_EPISODES", 6)
+    options = {"horizon": 8, "agent_collision_penalty": 1.0}
+    section = Section("maobs/spread-3a", task_options("spread-3a", {**options, "action_mode": "discrete"}))
+    on_page = report.play_baselines(section)
+    compared = play_baselines("maobs/spread-3a", {**options, "action_mode": "force"}, episodes=6)
+    assert [*on_page] == ["random", "heuristic", "orca"] and [*compared] == ["random", "heuristic"]
+    for name in ("return", "coverage", "collisions_agents", "collisions_obstacles", "path_efficiency"):
+        for policy, means in on_page.items():
+            assert table[name][policy] == pytest.approx(means[name], rel=1e-12, nan_ok=True)
+            if policy in compared and name != "return":
+                assert compared[policy][name] == means[name]
+    assert compared["random"]["return_agent_0"] == on_page["random"]["score"]
+
+
+def test_the_same_twice_is_evaluated_once(trial_folder: Path, tmp_path: Path) -> None:
+    again = f"{trial_folder}/"
+    run(trial_folder, again, "--episodes", 2, "--num-agents", 2, 2, "--csv", tmp_path / "t.csv", "--baselines", "none")
+    assert [*pd.read_csv(tmp_path / "t.csv")["episodes"]] == [2]
 
 
 def test_teams_of_other_sizes(trial_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -158,7 +158,7 @@ def test_baselines_are_means_over_whole_episodes(options: dict[str, Any]) -> Non
     assert baselines["random"]["success"] == 0.0 < 0.9 < baselines["heuristic"]["success"] <= 1.0
     length = baselines["heuristic"]["episode_length"]
     assert length == 100.0 if "terminate_on_success" not in options else 5.0 < length < 60.0
-    single = make_vec("spread-3a", **options)
+    single = make_vec("spread-3a", **{**options, "action_mode": "mpe"})  # the task's own
     single.reset(seed=0)
     returned, done = 0.0, False
     while not done:

@@ -35,7 +35,7 @@ def test_the_safe_velocity_is_half_of_what_is_needed_from_each() -> None:
     """Head-on, by the definition: both give way alike, and just so far that they pass without a contact."""
     env = placed([[-0.3, 0.0], [0.3, 0.0], [0.9, 0.0], [-0.9, 0.0]])
     env.world.velocity[0, :2] = wanted = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    safe = make_policy(env, "orca")._safe(0, wanted)
+    (safe,) = make_policy(env, "orca")._safe(wanted[None])
     assert safe[0] == pytest.approx(-safe[1], abs=1e-6)
     time = np.linspace(0.0, 0.5, 101)[:, None]
     apart = np.linalg.norm(env.world.position[0, 0] - env.world.position[0, 1] + time * (safe[0] - safe[1]), axis=1)
@@ -75,6 +75,24 @@ def test_own_targets_and_walls() -> None:
     position[0], position[2] = position[7].copy(), position[5].copy()  # each at the other's target
     actions = make_policy(env, "orca")(env.observe())[0]
     assert actions[0, 1] > 0.1 and actions[2, 1] < -0.1
+
+
+def test_copies_are_many_single_ones() -> None:
+    """Also after a reset of some, when obstacles lie elsewhere."""
+    env = maobs.make_vec("spread-9a", num_envs=3)
+    policy = make_policy(env, "orca")
+    for seed, mask in ((0, None), (7, np.array([False, True, False]))):
+        env.reset(seed=seed, mask=mask)
+        for _ in range(5):
+            env.step(policy(env.observe()))
+        wanted = -env.world.position[:, :9]
+        together = policy._safe(wanted)
+        for copy in range(3):
+            alone = maobs.make_vec("spread-9a")
+            alone.reset(seed=0)
+            alone.world.position, alone.world.velocity = env.world.position[[copy]], env.world.velocity[[copy]]
+            assert np.array_equal(make_policy(alone, "orca")._safe(wanted[[copy]])[0], together[copy])
+    assert (together != wanted).any()
 
 
 def test_where_there_is_none(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,6 +100,7 @@ def write_trial(folder: Path, trial: TrialSpec, scores: list[float]) -> Path:
     for number, score in enumerate(scores, start=1):
         metrics = {"coverage": 0.5 + number / 100, "success": 0.25, "all_covered": 0.25, "collision_free": 0.75}
         metrics |= {"collisions_agents": 1.0, "collisions_obstacles": 2.0, "collisions_walls": 0.0}
+        metrics |= {"time_to_goal": 40.0 + trial.seed, "path_efficiency": 0.5 + trial.seed / 10}
         runners = {"episode_metrics": metrics, "agent_episode_returns_mean": {"agent_0": score}}
         result = {
             "num_env_steps_sampled_lifetime": 1000 * number,
@@ -255,6 +256,8 @@ def test_the_page_holds_the_numbers_and_fetches_nothing(page: Path) -> None:
         (["RESULTS/small", "--output", "RESULTS/page.html"], "exists: add --force to replace it"),
         (["RESULTS/small", "--output", "RESULTS"], "is a folder: give a file in it"),
         (["RESULTS/small", "--output", "RESULTS/no/page.html"], "there is no folder"),
+        (["RESULTS/small/ours-seed1"], "is a trial: give its experiment's, 'RESULTS/small'"),
+        (["RESULTS/small", "--force", "--seed", "-1"], "--seed -1 is illegal; legal: an integer >= 0"),
     ],
 )
 def test_mistakes_end_in_a_sentence(
@@ -265,7 +268,7 @@ def test_mistakes_end_in_a_sentence(
     before = page.read_bytes()
     with pytest.raises(SystemExit) as stop:
         main([argument.replace("RESULTS", str(page.parent)) for argument in arguments])
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+    assert stop.value.code == 2 and message.replace("RESULTS", str(page.parent)) in capsys.readouterr().err
     assert page.read_bytes() == before
 
 
@@ -367,6 +370,30 @@ def test_the_page_is_accessible(browser: Any, page: Path) -> None:
     labels = tab.evaluate("[...figures.values()].map((figure) => figure.left[0].major_label_text_color)")
     assert {*labels} == {"#a4acb8"}  # charts are dark now, too
     assert wrong == []
+
+
+def test_on_a_laptop_and_on_paper(browser: Any, page: Path) -> None:
+    """Nothing has been scrolled to, and nothing is missing or cut off."""
+    tab = browser.new_context(viewport={"width": 1280, "height": 800}, color_scheme="dark").new_page()
+    tab.goto(page.as_uri())
+    tab.wait_for_function("() => plots.length > 5 && plots.every((plot) => figures.get(plot))")
+    own = "plots.every((plot) => figures.get(plot).id === data.charts[plot.id].root_id)"
+    assert tab.evaluate(own) and tab.evaluate("scrollY") == 0
+    wide = "-12,345.6\\n(-23,456.7 to -10,234.5)"
+    tab.evaluate(f"document.querySelectorAll('.results td').forEach((it) => {{ it.textContent = '{wide}'; }})")
+    cut = "[...document.querySelectorAll('.results .scroll')].filter((it) => it.scrollWidth > it.clientWidth).length"
+    assert tab.evaluate(cut) == 0
+    widths = tab.evaluate("plots.map((plot) => plot.clientWidth)")
+    tab.evaluate("dispatchEvent(new Event('beforeprint'))")
+    tab.emulate_media(media="print", color_scheme="dark")
+    tab.set_viewport_size({"width": 1000, "height": 700})
+    assert tab.evaluate(cut) == 0
+    assert tab.evaluate("plots.map((plot) => plot.clientWidth)") == widths
+    assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert "invert" in tab.evaluate("getComputedStyle(plots[0]).filter")
+    tab.emulate_media(media="screen")
+    tab.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert tab.evaluate("plots.every((plot) => !plot.style.width && getComputedStyle(plot).filter === 'none')")
 
 
 def test_the_page_on_a_phone(browser: Any, page: Path) -> None:

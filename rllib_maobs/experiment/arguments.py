@@ -208,7 +208,7 @@ def make_parser(
     how.add_argument(
         "--mlflow", action="store_true", help="log to MLflow: to MLFLOW_TRACKING_URI, or mlflow.db in --results-dir"
     )
-    how.add_argument("--video", action="store_true", help="film an episode of every checkpoint, for TensorBoard")
+    how.add_argument("--video", action="store_true", help="film an episode of every checkpoint, for the dashboards")
 
     where = parser.add_argument_group("where results go")
     where.add_argument(

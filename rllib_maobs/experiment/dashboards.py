@@ -59,7 +59,11 @@ def make_callbacks(name: str, args: Namespace) -> list[tune.Callback]:
         from ray.air.integrations.wandb import WandbLoggerCallback
 
         class Wandb(_Grouped, WandbLoggerCallback):
-            pass
+            def log_film(self, trial: Any, path: Path, steps: int) -> None:
+                import wandb
+
+                film = {"episode": wandb.Video(str(path)), "training_iteration": steps}
+                WandbLoggerCallback.log_trial_result(self, 0, trial, film)
 
         # It logs in processes of a Ray that may have been started before WANDB_MODE was set.
         mode = os.environ.get("WANDB_MODE")
@@ -67,11 +71,22 @@ def make_callbacks(name: str, args: Namespace) -> list[tune.Callback]:
     if args.mlflow:
         from ray.air.integrations.mlflow import MLflowLoggerCallback
 
-        class MLflow(_Grouped, MLflowLoggerCallback):
-            pass
-
         # The program's own place comes first, as a server's.
         uri = os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{args.results_dir / 'mlflow.db'}")
+
+        class MLflow(_Grouped, MLflowLoggerCallback):
+            def setup(self, *args_: Any, **info: Any) -> None:
+                import mlflow
+
+                self._client = mlflow.MlflowClient(uri)
+                # Without a server MLflow would put films into the present folder.
+                if "MLFLOW_TRACKING_URI" not in os.environ and self._client.get_experiment_by_name(name) is None:
+                    self._client.create_experiment(name, (args.results_dir / "mlflow").absolute().as_uri())
+                super().setup(*args_, **info)
+
+            def log_film(self, trial: Any, path: Path, steps: int) -> None:
+                self._client.log_artifact(self._trial_runs[trial], str(path), "episodes")
+
         callbacks.append(MLflow(tracking_uri=uri, experiment_name=name))
     return callbacks
 
@@ -138,13 +153,28 @@ def settings_of(config: Mapping[str, Any]) -> dict[str, bool | int | float | str
 
 
 class _Grouped:
-    """Hands a logger `curves_of` a result instead of the result."""
+    """Hands a logger `curves_of` a result instead of the result, and the films that `TensorBoard` has made."""
 
     def log_trial_result(self, iteration: int, trial: Any, result: dict[str, Any]) -> None:
-        """Log one result; its step is in env steps."""
+        """Log one result; its step is in env steps, by the names that MLflow and W&B look for."""
         steps = int(result[STEPS])
-        shown = {**curves_of(result), "env_steps": steps, "timesteps_total": steps, "training_iteration": iteration}
+        shown = {**curves_of(result), "env_steps": steps, "timesteps_total": steps, "training_iteration": steps}
         super().log_trial_result(iteration, trial, shown)  # type: ignore[misc]
+
+    def log_trial_save(self, trial: Any) -> None:
+        """Show the film of the checkpoint that was written, if there is one."""
+        super().log_trial_save(trial)  # type: ignore[misc]
+        if (path := _film_path(trial)).exists():
+            self.log_film(trial, path, int(trial.last_result[STEPS]))
+
+    def log_film(self, trial: Any, path: Path, steps: int) -> None:
+        """Log the film of a checkpoint after so many env steps."""
+        raise NotImplementedError
+
+
+def _film_path(trial: Any) -> Path:
+    """Return where the film of a trial's last checkpoint is; `TensorBoard`, the first of the loggers, makes it."""
+    return Path(trial.local_path) / f"episode-{int(trial.last_result[STEPS])}.gif"
 
 
 class TensorBoard(TBXLoggerCallback):
@@ -173,7 +203,7 @@ class TensorBoard(TBXLoggerCallback):
         if not self._video or trial not in self._trial_writer:
             return
         steps = int(trial.last_result[STEPS])
-        path = Path(trial.local_path) / f"episode-{steps}.gif"
+        path = _film_path(trial)
         try:
             with trial.checkpoint.as_directory() as folder:  # it may be at a URL
                 film(TrialSpec(**trial.config), folder, path)

@@ -25,7 +25,9 @@ SAVING = ".saving"
 """The folder of a trial where its next checkpoint is written, from where Tune copies it."""
 STATE = ".state"
 """The folder of an experiment with copies of Tune's state."""
-_LOG_FILES = ("result.json", "progress.csv", "events.out.tfevents.*")
+_LOG_FILES = ("result.json", "progress.csv", "events.out.*")
+# TensorBoard takes all files with tfevents in their names for runs, at any depth: copies are called otherwise.
+_EVENTS, _KEPT_EVENTS = "tfevents", "tf-events"
 _STATE_FILES = ("*.json", "*.pkl")
 
 
@@ -120,7 +122,7 @@ def keep_logs(checkpoint: Path, *folders: Path) -> None:
     try:
         aside.mkdir()
         for path in {path.name: path for folder in folders for path in _logs(folder)}.values():
-            shutil.copyfile(path, aside / path.name)
+            shutil.copyfile(path, aside / path.name.replace(_EVENTS, _KEPT_EVENTS))
         write_checksums(aside)
         aside.rename(checkpoint / LOGS)
     finally:
@@ -137,7 +139,8 @@ def put_back_logs(checkpoint: Path | None, *folders: Path, finished: bool = Fals
     """
     if checkpoint is not None and not (checkpoint / LOGS).is_dir():
         return  # of a revision that kept none
-    kept = {} if checkpoint is None else {path.name: path for path in _logs(checkpoint / LOGS)}
+    copies = [] if checkpoint is None else _logs(checkpoint / LOGS)
+    kept = {path.name.replace(_KEPT_EVENTS, _EVENTS): path for path in copies}
     for folder in folders:
         if not finished:
             for path in [path for path in _logs(folder) if path.name not in kept]:

@@ -9,8 +9,9 @@ const figures = new Map();
 
 async function draw(element) {
   figures.set(element, null);
-  await Bokeh.embed.embed_item(data.charts[element.id], element.id);
-  figures.set(element, Bokeh.documents.at(-1).roots()[0]);
+  const chart = data.charts[element.id];
+  await Bokeh.embed.embed_item(chart, element.id);
+  figures.set(element, Bokeh.documents.flatMap((it) => it.roots()).find((root) => root.id === chart.root_id));
   paint(element);
   show(element);
 }
@@ -45,7 +46,24 @@ const redraw = (section) => section.querySelectorAll(".plot").forEach((plot) => 
 const seen = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) if (isIntersecting && !figures.has(target)) draw(target);
 }, { rootMargin: "600px" });
-for (const plot of document.querySelectorAll(".plot")) seen.observe(plot);
+const plots = [...document.querySelectorAll(".plot")];
+for (const plot of plots) seen.observe(plot);
+// The others when there is nothing else to do: who prints the page, or searches in it, has not scrolled to them.
+const idle = window.requestIdleCallback ?? ((then) => setTimeout(then, 100));
+async function drawRest() {
+  const plot = plots.find((it) => !figures.has(it));
+  if (!plot) return;
+  await draw(plot);
+  idle(drawRest);
+}
+addEventListener("load", () => idle(drawRest));
+// Paper is narrower, and white. Charts are not drawn anew for it: they keep their width, and page.css inverts dark ones.
+addEventListener("beforeprint", () => {
+  document.documentElement.classList.toggle("dark", dark.matches);
+  const widths = plots.map((plot) => plot.clientWidth);
+  plots.forEach((plot, number) => { plot.style.width = `${widths[number]}px`; });
+});
+addEventListener("afterprint", () => plots.forEach((plot) => { plot.style.width = ""; }));
 dark.addEventListener("change", () => figures.forEach((figure, element) => figure && paint(element)));
 for (const section of document.querySelectorAll(".task")) {
   section.addEventListener("change", (event) => event.target.closest(".axis") && redraw(section));

@@ -95,7 +95,7 @@ def _section(name: str, section: Section, episodes: list[str]) -> dict[str, Any]
         "table": _results(section),
         "table_text": f"Interquartile means over the seeds, with {bands}. A seed's result is the mean of its last "
         f"{' or '.join(map(str, last))} evaluations, without exploration. Score: undiscounted return of the first "
-        f"agent. Baselines, which are not trained: means over 100 episodes.",
+        f"agent. Baselines, which are not trained: means over 100 episodes, with the task's own action_mode.",
         "curves": _placed(f"{name}-curve", [curve_chart(section, m, lines) for m in section.measures if m in _CURVES]),
         "curves_text": f"Interquartile means over the seeds, with {bands}"
         f"{'; with so few seeds they say little' if 1 < few < 5 else ''}.",

@@ -10,10 +10,9 @@ import pandas as pd
 
 from rllib_maobs.envs import SCENARIOS, make_scenario
 from rllib_maobs.experiment.arguments import read_object
+from rllib_maobs.experiment.baselines import task_options
 from rllib_maobs.experiment.report import LABELS, LAST, LAST_QUICK, SCORE, load_curves
 
-# How an agent is moved and what critics see: the task is the same, and so are its scores.
-_NOT_THE_TASK = ("action_mode", "state")
 MEASURES = {
     **{name: label for name, label in LABELS.items() if name not in ("all_covered", "collision_free")},
     "collisions": "contacts / episode",
@@ -156,6 +155,8 @@ def _read_folder(folder: Path) -> tuple[list[Trial], set[str]]:
     except (OSError, LookupError, TypeError, ValueError, AttributeError):  # nothing is there, or something else
         if experiment.is_file():
             raise ValueError(f"{str(folder)!r} has no evaluation yet: try again later") from None
+        if (folder / "result.json").is_file():
+            raise ValueError(f"{str(folder)!r} is a trial: give its experiment's, {str(folder.parent)!r}") from None
         raise ValueError(
             f"{str(folder)!r} is no results folder; legal: what a program in tuned_examples/ wrote to, with a folder "
             f"for each trial that holds its result.json"
@@ -210,10 +211,7 @@ def _origin(trial: Path, results: Sequence[Mapping[str, Any]]) -> dict[str, str]
 def _task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a trial was evaluated on, without what makes no other task."""
     options = {**settings.get("env_config", {}), **settings.get("evaluation_env_config", {})}
-    scenario = str(settings["env"]).removeprefix("maobs/")
-    if scenario in SCENARIOS:
-        options = asdict(make_scenario(scenario, **options).options)
-    return {name: value for name, value in options.items() if name not in _NOT_THE_TASK}
+    return task_options(str(settings["env"]).removeprefix("maobs/"), options)
 
 
 def _tell_apart(trials: Sequence[Trial]) -> None:
