@@ -12,7 +12,9 @@ from rllib_maobs.policies import make_policy, play_episodes
 # How agents are moved and what critics see is a choice of who trains: the task is the same, and so are its scores.
 _NOT_THE_TASK = ("action_mode", "state")
 _AT_ONCE = 100  # copies; more would be slower, for want of cache
-_PAIRS = 1_000_000  # of bodies, in all copies at once: some hundred megabytes
+# Of bodies, in all copies at once: some hundred megabytes of an entity actor, where each agent looks at each pair of
+# a target and another agent.
+_TRIPLES = 20_000_000
 
 
 def task_options(env: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -44,7 +46,7 @@ def play_many(env: str, options: Mapping[str, Any], policy: str, episodes: int, 
     """
     rows, done = [], 0
     bodies = sum(group.count for group in make_scenario(env, **options).bodies())
-    at_once = max(1, min(_AT_ONCE, _PAIRS // bodies**2))
+    at_once = max(1, min(_AT_ONCE, _TRIPLES // bodies**3))
     while done < episodes:
         vec = make_vec(env, num_envs=min(at_once, episodes - done), **options)
         rows.append(play_episodes(vec, make_policy(vec, policy, seed + done), seed + done))
