@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from rllib_maobs.layout import Entities, Layout, flat, layout_size, split
 from rllib_maobs.modules.actors import ACTORS, Actor, LSTMActor
 from rllib_maobs.modules.critics import CRITICS, Critic
-from rllib_maobs.modules.layers import mlp
+from rllib_maobs.modules.layers import mlp, tanh
 from rllib_maobs.options import Range
 
 Width = Annotated[int, Range(1)]
@@ -36,7 +36,7 @@ def squashed(offset: Tensor) -> Tensor:
         `(..., D + 1)`.
     """
     distance = (offset.square().sum(-1, keepdim=True) + 1e-12).sqrt()
-    return torch.cat([offset * (2.0 * torch.tanh(0.5 * distance) / distance), distance.clamp(max=_FAR)], dim=-1)
+    return torch.cat([offset * (2.0 * tanh(0.5 * distance) / distance), distance.clamp(max=_FAR)], dim=-1)
 
 
 class Edge(nn.Module):
