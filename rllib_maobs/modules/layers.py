@@ -3,8 +3,7 @@
 import itertools
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
@@ -29,8 +28,3 @@ def mlp(sizes: Sequence[int], activation: str = "relu") -> nn.Sequential:
     for fan_in, fan_out in itertools.pairwise(sizes):
         layers += [nn.Linear(fan_in, fan_out), ACTIVATIONS[activation]()]
     return nn.Sequential(*layers[:-1])
-
-
-def tanh(x: Tensor) -> Tensor:
-    """Hyperbolic tangent by way of the sigmoid: compiled, torch's own takes three times as long."""
-    return 2.0 * torch.sigmoid(2.0 * x) - 1.0
