@@ -19,7 +19,7 @@ from torch import Tensor
 import rllib_maobs as maobs
 from rllib_maobs.layout import Entities, Layout, split
 from rllib_maobs.modules import EntityActor, EntityCritic, EntityLSTMActor
-from rllib_maobs.modules.entity import Edge
+from rllib_maobs.modules.entity import Edge, squashed
 from tests.conftest import small_config
 
 OBSERVATION: Layout = (
@@ -66,6 +66,16 @@ def test_permuting_the_state_changes_no_value() -> None:
         moved, acted = permuted(STATE, state, "agent", order), permuted(joint, action, "agent", order)
         torch.testing.assert_close(net(moved, acted, torch.eye(3).double()[whose]), value)
     assert not torch.allclose(net(state, permuted(joint, action, "agent", [0, 2, 1]), agent), value)
+
+
+def test_directions_are_right_in_single_precision() -> None:
+    """From 1e-8 to 100 away, with the absolute precision that numbers up to 2 have."""
+    torch.manual_seed(0)
+    offset = torch.randn(1000, 2) * 10.0 ** torch.linspace(-8, 2, 1000)[:, None]
+    exact = offset.double()
+    distance = (exact.square().sum(-1, keepdim=True) + 1e-12).sqrt()
+    expected = torch.cat([exact / distance * 2.0 * torch.tanh(distance / 2.0), distance.clamp(max=4.0)], dim=-1)
+    torch.testing.assert_close(squashed(offset).double(), expected, atol=1e-6, rtol=0.0)
 
 
 def test_nobody_around_is_heard_as_nothing() -> None:

@@ -1,5 +1,8 @@
 """Networks and RLModules: windows of LSTM actors, mixers, discrete actions; acting and learning are one computation."""
 
+import platform
+import resource
+
 import numpy as np
 import pytest
 import torch
@@ -10,9 +13,10 @@ from torch import nn
 from torch.utils._pytree import tree_map
 
 import rllib_maobs as maobs
-from rllib_maobs.layout import flat
+from rllib_maobs.layout import Entities, flat, layout_size
 from rllib_maobs.learner import TeamNetworks
 from rllib_maobs.modules import (
+    EntityActor,
     EpsilonGaussian,
     LSTMActor,
     Mixer,
@@ -85,15 +89,24 @@ def test_agents_that_share_networks_in_any_way(users: str) -> None:
                 torch.testing.assert_close(stack.own(gradient, users.index(name))[key], want)
 
 
-@pytest.mark.parametrize("network", [MLPActor, LSTMActor])
-def test_acting_plays_back_what_the_networks_would_do(network: type) -> None:
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("network", [MLPActor, LSTMActor, EntityActor])
+def test_acting_plays_back_what_the_networks_would_do(network: type, shared: bool) -> None:
     """To the bit, for every shape of inputs, with the parameters of the moment, of its own or another stack's."""
     names = ["a", "b", "c"]
-    stack, other = (Actors([network(flat(O), A, (H, 6)) for _ in range(3)], names) for _ in range(2))
+    layout = (Entities("self", 1, 1), Entities("agent", 2, 2, 2), Entities("target", 3, 3, 2))
+    size = layout_size(layout) if network is EntityActor else O
+
+    def actors() -> Actors:
+        settings = (layout, A, H, 6) if network is EntityActor else (flat(O), A, (H, 6))
+        networks = [network(*settings) for _ in names]
+        return Actors(networks[:1] * 3 if shared else networks, names)
+
+    stack, other = actors(), actors()
 
     def inputs(copies: int) -> Seen:
-        if network is MLPActor:
-            return Seen(torch.randn(copies, 3, O))
+        if network is not LSTMActor:
+            return Seen(torch.randn(copies, 3, size))
         return Seen(torch.randn(copies, 3, 5, O), (torch.rand(copies, 5) > 0.3).float())
 
     def check(copies: int) -> None:
@@ -107,6 +120,20 @@ def test_acting_plays_back_what_the_networks_would_do(network: type) -> None:
     check(7)
     stack.share(other)
     check(7)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library's memory is left as it is")
+def test_what_a_call_frees_the_next_one_takes() -> None:
+    """Without new pages of the system's: to fill them with zeros takes longer than most of what is computed in them."""
+    Stack([MLPActor(flat(O), A)])
+
+    def new_pages() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        _ = [torch.ones(2**20) for _ in range(10)]
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    new_pages()
+    assert new_pages() < 100  # of 10 x 1024
 
 
 def test_a_window_longer_than_the_episode_is_a_full_unroll(actor: LSTMActor) -> None:

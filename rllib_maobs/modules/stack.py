@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 from torch.utils._pytree import tree_map
 
+from rllib_maobs.memory import keep_freed_memory
 from rllib_maobs.modules.tracing import traced
 from rllib_maobs.registry import same
 
@@ -118,6 +119,7 @@ class Stack:
         tie: bool = False,
         like: Stack | None = None,
     ) -> None:
+        keep_freed_memory()  # what one call frees, the next one takes
         self.networks = list(networks)
         self.names = list(names or (f"network {i}" for i in range(len(networks))))
         for net, name in zip(networks, self.names, strict=True):

@@ -20,13 +20,30 @@ _VIEWS: dict[Any, Callable[..., Any]] = {
     aten.transpose.int: torch.transpose,
     aten.unsqueeze.default: torch.unsqueeze,
     aten.detach.default: torch.detach,
+    aten.alias.default: torch.detach,
+    aten.t.default: torch.t,
 }
+_RESHAPES = (aten.view.default, aten._unsafe_view.default)
 _PRODUCTS: dict[Any, Callable[..., Any]] = {aten.mul.Scalar: torch.mul, aten.mul.Tensor: torch.mul}
 _OTHERS: dict[Any, Callable[..., Any]] = {
-    aten.bmm.default: torch.bmm,
-    aten.add.Tensor: torch.add,
-    aten.relu.default: torch.relu,
-    aten.sum.dim_IntList: torch.sum,
+    operation: getattr(torch, operation.overloadpacket.__name__)
+    for operation in (
+        aten._softmax.default,
+        aten.add.Tensor,
+        aten.bmm.default,
+        aten.cat.default,
+        aten.clamp.default,
+        aten.div.Tensor,
+        aten.mm.default,
+        aten.pow.Tensor_Scalar,
+        aten.relu.default,
+        aten.select.int,
+        aten.sigmoid.default,
+        aten.sqrt.default,
+        aten.sub.Tensor,
+        aten.sum.dim_IntList,
+        aten.tanh.default,
+    )
 }
 _recording = threading.Lock()  # torch.fx replaces functions of all threads while it records
 
@@ -60,6 +77,9 @@ def _tidy(graph: fx.Graph) -> None:
     if not any(_writes(node) for node in graph.nodes):  # else it matters which tensors are one
         for node, same in _doubles(graph):
             node.replace_all_uses_with(same)
+    for node in graph.nodes:
+        if node.target in _RESHAPES and node.args[0].target in _RESHAPES:  # of the same numbers
+            node.args = node.args[0].args[0], *node.args[1:]
     graph.eliminate_dead_code()
     for node in graph.nodes:
         node.target = {**_VIEWS, **_PRODUCTS, **_OTHERS}.get(node.target, node.target)
