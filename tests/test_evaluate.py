@@ -11,7 +11,8 @@ import pytest
 
 from rllib_maobs.envs import make_scenario, make_vec
 from rllib_maobs.evaluate import jobs_of, main, summarise_episodes
-from rllib_maobs.experiment.baselines import play_baselines, task_options
+from rllib_maobs.experiment import baselines
+from rllib_maobs.experiment.baselines import play_baselines, play_many, task_options
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 from rllib_maobs.policies import make_policy, play_episodes
 from rllib_maobs.report import __main__ as report
@@ -54,6 +55,21 @@ def test_episodes_are_those_of_the_single_copies() -> None:
         single = make_vec("tunnel", horizon=40, terminate_on_success=True, start_noise=0.05)
         ((_, alone),) = play_episodes(single, make_policy(single, "heuristic"), seed=int(seed)).iterrows()
         pd.testing.assert_series_equal(alone, rows.iloc[index], check_names=False)
+
+
+def test_large_teams_are_played_in_fewer_copies_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[int]()
+
+    def recorded(env: str, num_envs: int, **options: Any) -> Any:
+        made.append(num_envs)
+        return make_vec(env, num_envs=num_envs, **options)
+
+    monkeypatch.setattr(baselines, "make_vec", recorded)
+    for num_agents, copies in ((3, [5]), (60, [4, 1]), (200, [1] * 5)):
+        made.clear()
+        options = make_scenario("spread-3a").resized(num_agents)
+        seeds = play_many("spread-3a", {**options, "horizon": 2}, "random", 5)["seed"]
+        assert (made, list(seeds)) == (copies, [0, 1, 2, 3, 4])
 
 
 def test_means_have_intervals_that_hold_them() -> None:
