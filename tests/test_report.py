@@ -156,6 +156,13 @@ def test_one_name_from_two_folders(tmp_path: Path) -> None:
         write_trial(tmp_path / folder, spec("ours", seed, actor_lr=rate), [-1.0])
     (section,), _ = read_results([tmp_path / "a", tmp_path / "b"])
     assert [*section.rows] == ["ours"]
+    (saved,) = (tmp_path / "b").glob("*/result.json")  # an earlier revision's, which saved at other times
+    result = json.loads(saved.read_text())
+    assert result["config"].pop("varied") == {}
+    result["config"]["checkpoint_freq"] = 7
+    saved.write_text(json.dumps(result) + "\n")
+    (section,), _ = read_results([tmp_path / "a", tmp_path / "b"])
+    assert [*section.rows] == ["ours"]
     for other in ("c", "d"):
         (section,), _ = read_results([tmp_path / "a", tmp_path / other])
         assert [*section.rows] == ["ours (a)", f"ours ({other})"]

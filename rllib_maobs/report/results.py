@@ -218,7 +218,7 @@ def _tell_apart(trials: Sequence[Trial]) -> None:
     """Name the folder in the label where trials of one name come from several and are not one another's seeds."""
     for label in {trial.label for trial in trials}:
         alike = [trial for trial in trials if trial.label == label]
-        kinds = [json.dumps(_without_seed(trial.settings), sort_keys=True, default=str) for trial in alike]
+        kinds = [json.dumps(_training(trial.settings), sort_keys=True, default=str) for trial in alike]
         seeds = [trial.settings["seed"] for trial in alike]
         folders = {trial.folder.parent for trial in alike}
         if len(folders) > 1 and (len({*kinds}) > 1 or len({*seeds}) < len(seeds)):
@@ -226,6 +226,10 @@ def _tell_apart(trials: Sequence[Trial]) -> None:
                 trial.label = f"{label} ({trial.folder.parent.name})"
 
 
-def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what seeds of one training have in common: each may start from a seed of another one."""
-    return {**settings, "seed": None, "start_from": str(Path(settings.get("start_from") or "").parent)}
+def _training(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what seeds of one training have in common: each may start from a seed of another one.
+
+    How often they are saved changes nothing, and what is empty may not have been there in an earlier revision.
+    """
+    same = {name: value for name, value in settings.items() if name not in ("seed", "checkpoint_freq") and value != {}}
+    return {**same, "start_from": str(Path(settings.get("start_from") or "").parent)}
