@@ -8,8 +8,9 @@ CHECKPOINT is the folder of an RLlib algorithm checkpoint (of this package, or o
 `MAObsEnv`), or of a trial, whose last checkpoint counts, or a file of `rllib_maobs.export`. Each plays without
 exploration in the environment and with the options that its training evaluated with, unless NAME=VALUE says otherwise.
 Beside them play random play, the scenario's heuristic and, where each agent has a target, ORCA
-(`pip install "rllib-maobs[orca]"`), always with the task's own action_mode. Of every measure there is the mean over the
-episodes and a 95 % bootstrap interval of it.
+(`pip install -c constraints.txt -e ".[orca]"`), always with the task's own action_mode. Of every measure there is the
+mean over the episodes and a 95 % bootstrap interval of it. The return is the mean over the agents; scores elsewhere are
+the first agent's return, which is another number where rewards differ (walled tunnels).
 """
 
 import argparse
@@ -109,9 +110,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     episodes = pd.concat(rows, ignore_index=True)
     table = summarise_episodes(episodes)
     print(to_text(table))
-    print(f"\n{args.episodes} episodes each from seed {args.seed}; mean, and below it a 95 % bootstrap interval.")
+    print(f"\n{args.episodes} episodes each from seed {args.seed}; mean, and below it a 95 % bootstrap interval,")
+    print("where episodes differ. Return: the mean over the agents; covered is a target with an agent within 0.1.")
     if {*BASELINES} & {*table["policy"]}:
-        print("What is not trained acts with each task's own action_mode, and so has one number there in all tables.")
+        print("What is not trained acts with each task's own action_mode.")
     _write(table, episodes, args)
     if recorder is not None:
         of_jobs = table.iloc[[i for i, name in enumerate(table["policy"]) if name not in BASELINES]]
@@ -224,7 +226,10 @@ def to_text(table: pd.DataFrame) -> str:
     cells = []
     for _, row in table.iterrows():
         show = {name: LABELS[name][1].format for name in measures}
-        cells.append([f"{row['env']}, {row['agents']} agents", row["policy"], *(show[m](row[m]) for m in measures)])
+        means = {name: show[name](row[name]) for name in measures}
+        if row.get("success") == 0.0:
+            means |= {"time_to_goal": "-"}  # no episode has one
+        cells.append([f"{row['env']}, {row['agents']} agents", row["policy"], *(means[m] for m in measures)])
         bounds = [[show[name](row[f"{name}_{end}"]) for end in ("low", "high")] for name in measures]
         cells.append(["", "", *("" if low == high else f"{low} .. {high}" for low, high in bounds)])
     return format_table(["task", "policy", *(LABELS[name][0] for name in measures)], cells)

@@ -114,7 +114,7 @@ def export_agents(
     if not path.absolute().parent.is_dir():
         raise ValueError(f"there is no folder {path.absolute().parent} for {path.name}")
     if missing := [name for name in NEEDED[ending] if find_spec(name) is None]:
-        raise ImportError(f'{ending} files need {", ".join(missing)}: pip install "rllib-maobs[export]"')
+        raise ImportError(f'{ending} files need {", ".join(missing)}: pip install -c constraints.txt -e ".[export]"')
     source, description = _source(checkpoint, agent, ending)
     if ending == ".onnx":
         write_aside(path, _onnx(source, description))

@@ -389,7 +389,7 @@ def _needed(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise ImportError(f'exported files need {name}: pip install "rllib-maobs[export]"') from error
+        raise ImportError(f'exported files need {name}: pip install -c constraints.txt -e ".[export]"') from error
 
 
 def _refuse(value: Any) -> Any:

@@ -43,7 +43,7 @@ class OrcaPolicy:
         try:
             import pyrvo
         except ImportError as error:
-            raise ImportError('the policy "orca" needs pyrvo: pip install "rllib-maobs[orca]"') from error
+            raise ImportError('the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"') from error
         self._env, self._library, self._rng = env, pyrvo, np.random.default_rng(seed)
         world = env.world
         solid = [g.name for g in world.groups if g.collides and not g.movable]

@@ -195,7 +195,7 @@ def test_other_loggers_get_the_same_curves_and_films(trial: SimpleNamespace, tmp
     [
         ("--wandb", "wandb", "error: --wandb needs wandb: pip install wandb"),
         ("--mlflow", "mlflow", "error: --mlflow needs mlflow: pip install mlflow-skinny sqlalchemy alembic"),
-        ("--video", "pygame", '--video needs pygame: pip install "rllib-maobs[render]"'),
+        ("--video", "pygame", '--video needs pygame: pip install -c constraints.txt -e ".[render]"'),
         ("--video", "nothing", "--video: my_env is not an environment of this package"),
     ],
 )

@@ -336,6 +336,16 @@ def test_a_trial_that_waits_is_as_fast_as_another_seed_of_its_algorithm() -> Non
     assert table.table(trials).splitlines()[0].endswith("about 0:00:24 left")
 
 
+def test_compiling_does_not_count_as_slow_training() -> None:
+    table = ProgressTable(every_s=30.0)
+    trial = fake("maddpg", 0, 1000, status="RUNNING", last_result={})
+    fills = {"learners": {"__all_modules__": {}}}
+    for seconds, steps, more in ((1.0, 50, fills), (61.0, 100, {}), (63.0, 200, {})):
+        trial.last_result = result("maddpg", 0, steps, -5.0) | {"time_total_s": seconds} | more
+        table.should_report([trial])
+    assert table.table([trial]).splitlines()[0].endswith("about 0:00:16 left")  # 800 env steps at 50/s
+
+
 # --- The command line ---------------------------------------------------------------------------------------------
 
 
@@ -1014,7 +1024,7 @@ def test_a_film_that_fails_says_why(run: SimpleNamespace, tmp_path: Path, monkey
     assert film_best(results, foreign) == "No film: mine is not an environment of this package."
     monkeypatch.setitem(sys.modules, "pygame", None)  # as if it were not installed
     said = film_best(results, specs, others)
-    assert said == 'No film: pictures need pygame: pip install "rllib-maobs[render]"'
+    assert said == 'No film: pictures need pygame: pip install -c constraints.txt -e ".[render]"'
     assert not (results / "episode.gif").exists()
 
 

@@ -99,4 +99,5 @@ def test_where_there_is_none(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert baselines_of(Task("obstacle-predator-prey", {})) == ["random", "heuristic"]
     monkeypatch.setitem(sys.modules, "pyrvo", None)
     assert baselines_of(Task("spread-3a", {})) == ["random", "heuristic"]
-    assert 'left out: the policy "orca" needs pyrvo: pip install "rllib-maobs[orca]"' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert 'left out: the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"' in said

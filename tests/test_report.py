@@ -283,7 +283,7 @@ def test_without_bokeh(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     monkeypatch.setattr("rllib_maobs.report.__main__.find_spec", lambda name: None)
     with pytest.raises(SystemExit):
         main([str(page.parent / "small"), "--force"])
-    assert 'the report needs bokeh: pip install "rllib-maobs[report]"' in capsys.readouterr().err
+    assert 'the report needs bokeh: pip install -c constraints.txt -e ".[report]"' in capsys.readouterr().err
 
 
 def test_nothing_is_half_written(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_a_missing_optuna_is_named(
     monkeypatch.setattr("rllib_maobs.experiment.search.find_spec", lambda name: None)
     with pytest.raises(SystemExit):
         EXPERIMENT.main(["--search", "optuna", "--results-dir", str(tmp_path / "new")])
-    assert '--search optuna needs Optuna: pip install "rllib-maobs[search]"' in capsys.readouterr().err
+    assert '--search optuna needs Optuna: pip install -c constraints.txt -e ".[search]"' in capsys.readouterr().err
 
 
 def test_rates_cost_no_time_and_batches_do() -> None:

@@ -102,4 +102,4 @@ def _import(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise ImportError(f'recording needs {name}: pip install "rllib-maobs[render]"') from error
+        raise ImportError(f'recording needs {name}: pip install -c constraints.txt -e ".[render]"') from error

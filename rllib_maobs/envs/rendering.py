@@ -47,7 +47,7 @@ def import_pygame() -> Any:
     try:
         import pygame
     except ImportError as error:
-        raise ImportError('pictures need pygame: pip install "rllib-maobs[render]"') from error
+        raise ImportError('pictures need pygame: pip install -c constraints.txt -e ".[render]"') from error
     return pygame
 
 

@@ -22,7 +22,7 @@ from rllib_maobs.experiment.trial import TrialSpec
 _NEEDS = {
     "wandb": ("wandb", "pip install wandb"),
     "mlflow": ("mlflow", "pip install mlflow-skinny sqlalchemy alembic"),
-    "video": ("pygame", 'pip install "rllib-maobs[render]"'),
+    "video": ("pygame", 'pip install -c constraints.txt -e ".[render]"'),
 }
 
 

@@ -34,8 +34,8 @@ class ProgressTable(ProgressReporter):
     def __init__(self, every_s: float) -> None:
         self._every_s = every_s
         self._started = self._reported = time.monotonic()
-        # Trial id -> env steps and seconds of its first result since it started: where its speed is counted from, for
-        # compiling and filling the replay buffer come before.
+        # Trial id -> env steps and seconds of its first result with an update since it started: where its speed is
+        # counted from, for compiling and filling the replay buffer come before.
         self._from: dict[str, tuple[int, float]] = {}
         self._begun = False
 
@@ -48,7 +48,7 @@ class ProgressTable(ProgressReporter):
     def should_report(self, trials: list[Any], done: bool = False) -> bool:
         """Return whether it is time for a table."""
         for trial in trials:
-            if trial.status == "RUNNING" and trial.last_result.get(STEPS):
+            if trial.status == "RUNNING" and trial.last_result.get(STEPS) and _learns(trial.last_result):
                 self._from.setdefault(trial.trial_id, (trial.last_result[STEPS], trial.last_result["time_total_s"]))
         if all(trial.status == "PENDING" for trial in trials):
             return False
@@ -113,7 +113,7 @@ class ProgressTable(ProgressReporter):
         return f"{head}\n{format_table(header, rows)}{note}"
 
     def _speed(self, trial: Any) -> float | None:
-        """Return env steps per second since the trial's first result, once there is a second one."""
+        """Return env steps per second since the trial's first result with an update, once there is a second one."""
         result = trial.last_result
         if trial.trial_id not in self._from:
             return None

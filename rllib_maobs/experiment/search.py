@@ -22,7 +22,7 @@ _REDUCTION = 3
 def check_installed() -> None:
     """Raise a ValueError that says what to install if Optuna is missing."""
     if find_spec("optuna") is None:
-        raise ValueError('--search optuna needs Optuna: pip install "rllib-maobs[search]"')
+        raise ValueError('--search optuna needs Optuna: pip install -c constraints.txt -e ".[search]"')
 
 
 class Space(NamedTuple):

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Not resolved: the page calls results what the user calls them.
         folders = list(dict.fromkeys(Path(os.path.abspath(local(folder))) for folder in args.folders))
         if find_spec("bokeh") is None:
-            raise ValueError('the report needs bokeh: pip install "rllib-maobs[report]"')
+            raise ValueError('the report needs bokeh: pip install -c constraints.txt -e ".[report]"')
         if not 0 <= args.seed < 2**63:
             raise ValueError(f"--seed {args.seed} is illegal; legal: an integer >= 0 of 63 bits")
         sections, notes = read_results(folders)

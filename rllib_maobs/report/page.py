@@ -58,7 +58,7 @@ def build_page(
     here = files("rllib_maobs.report")
     return environment.from_string(here.joinpath("page.html").read_text("utf-8")).render(
         title=f"Results: {', '.join(dict.fromkeys(folders))}",
-        subtitle=f"{len(folders)} trained teams on {len(sections)} task{'s' if len(sections) > 1 else ''}.",
+        subtitle=f"{_counted(len(folders), 'trained team')} on {_counted(len(sections), 'task')}.",
         css=Markup(here.joinpath("page.css").read_text("utf-8")),
         js=Markup(here.joinpath("page.js").read_text("utf-8")),
         bokeh=Markup("\n".join(Resources(mode="inline", components=["bokeh"], log_level="warn").js_raw)),
@@ -71,6 +71,10 @@ def build_page(
             "episodes": {view["id"]: [*named.values()] for view, named in zip(shown, episodes, strict=True)},
         },
     )
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _section(name: str, section: Section, episodes: list[str]) -> dict[str, Any]:
