@@ -658,11 +658,8 @@ def test_networks_are_compared_on_equal_terms(script: str, agents: int, batch: i
         config = spec.build_config()
         config.validate()
         assert (len(config.team.agents), config.train_batch_size_per_learner) == (agents, batch)
-        assert (config.updates_per_env_step, config.num_envs_per_env_runner, len(set(config.module_ids))) == (
-            1 / 8,
-            32,
-            1,
-        )
+        assert (config.updates_per_env_step, config.num_envs_per_env_runner) == (1 / 8, 32)
+        assert len(set(config.module_ids)) == 1
         assert spec.stop_timesteps == experiment.stop_timesteps
         networks[config.actor, config.critic] += 1
     assert networks == {("mlp", "mlp"): 6, ("lstm", "mlp"): 6, ("entity", "entity"): 6}
@@ -1070,4 +1067,4 @@ def test_a_full_run_measures_how_long_it_takes(
     out = capsys.readouterr().out
     assert "Measured with 1 at once in" in out and "Replay will take up to 0 MB" in out
     (row,) = [line.split() for line in out.splitlines() if line.startswith("maddpg-entity")]
-    assert row[1:3] == ["300", "0.125"] and float(row[3]) > 1.0
+    assert row[1:3] == ["300", "0.25"] and float(row[3]) > 1.0
