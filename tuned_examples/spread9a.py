@@ -37,7 +37,7 @@ experiment = Experiment(
             "num_envs_per_env_runner": 32,
             "stop_timesteps": 300_000,
             "quick": {
-                "stop_timesteps": 72_000,
+                "stop_timesteps": 48_000,
                 "steps_per_iteration": 4_000,
                 "evaluation_duration": 20,
                 "torch_compile": True,
