@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from rllib_maobs.envs import make_scenario, make_vec
-from rllib_maobs.evaluate import jobs_of, main, summarise_episodes
+from rllib_maobs.evaluate import jobs_of, main, summarise_episodes, to_text
 from rllib_maobs.experiment import baselines
 from rllib_maobs.experiment.baselines import play_baselines, play_many, task_options
 from rllib_maobs.experiment.trial import Trial, TrialSpec
@@ -70,6 +70,12 @@ def test_large_teams_are_played_in_fewer_copies_at_once(monkeypatch: pytest.Monk
         options = make_scenario("spread-3a").resized(num_agents)
         seeds = play_many("spread-3a", {**options, "horizon": 2}, "random", 5)["seed"]
         assert (made, list(seeds)) == (copies, [0, 1, 2, 3, 4])
+
+
+def test_who_never_succeeds_has_no_time_to_success() -> None:
+    rows = pd.DataFrame({"env": "e", "agents": 3, "options": "", "policy": ["a", "b"], "success": [0.0, 1.0]})
+    lines = to_text(summarise_episodes(rows.assign(time_to_goal=[100.0, 14.0]))).splitlines()
+    assert [line.split()[-1] for line in lines if " agents" in line] == ["-", "14.0"]
 
 
 def test_means_have_intervals_that_hold_them() -> None:
