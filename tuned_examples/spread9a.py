@@ -28,6 +28,7 @@ experiment = Experiment(
             "tau": 0.01,
             "train_batch_size_per_learner": 64,
             "updates_per_env_step": 1 / 8,
+            "action_regularization": 0.01,  # without it a team may run away for good, its actions all at the limit
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),

@@ -4,8 +4,8 @@
     python tuned_examples/spread9a_networks.py --quick   # MADDPG with each of the networks, one seed
     python tuned_examples/spread9a_networks.py --help
 
-Not in the paper. Batches are smaller than with three agents, as in `spread9a.py`, and the trainings shorter: an update
-takes several times as long. Training pays the task's own price for contacts.
+Not in the paper. Batches are smaller than with three agents, actions regularised and contacts at the task's own price,
+as in `spread9a.py`; and trainings are shorter: an update takes several times as long.
 """
 
 from dataclasses import replace
@@ -19,8 +19,8 @@ experiment = replace(
     name="spread-9a-networks",
     env="maobs/spread-9a",
     variants={row: {**settings, "train_env_config": TRAINING} for row, settings in three_agents.variants.items()},
-    stop_timesteps=60_000,
-    training={**three_agents.training, "train_batch_size_per_learner": 64},
+    stop_timesteps=40_000,
+    training={**three_agents.training, "train_batch_size_per_learner": 64, "action_regularization": 0.01},
 )
 
 if __name__ == "__main__":
