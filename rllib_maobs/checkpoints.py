@@ -93,6 +93,13 @@ def saved_networks(config: JointConfig, checkpoint: str | Path) -> dict[str, dic
                 f"The networks of policy {mid!r} in {str(checkpoint)!r} acted in {source.action_space}, here they act "
                 f"in {module.action_space}: the same output is another action."
             )
+        for settings in ("actor_settings", "critic_settings"):
+            was, now = (m.model_config.get(settings, {}) for m in (source, module))
+            if was != now:
+                logger.warning(
+                    f"The networks of policy {mid!r} in {str(checkpoint)!r} had {settings}={was}, here {now}, "
+                    f"with which the same weights may be another network."
+                )
         states[mid] = source.get_state()
         there = {name: tuple(value.shape) for name, value in states[mid].items()}
         expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}

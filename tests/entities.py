@@ -26,17 +26,19 @@ def layers(p: Named, name: str, x: Tensor) -> Tensor:
     return x
 
 
-def squash(offset: Tensor) -> Tensor:
+def squash(offset: Tensor, near: float | None) -> Tensor:
     distance = math.sqrt(sum(float(o) ** 2 for o in offset) + 1e-12)
-    return torch.tensor([*(float(o) / distance * 2 * math.tanh(distance / 2) for o in offset), min(distance, 4.0)])
+    enlarged = [] if near is None else [float(o) / (distance + near) for o in offset]
+    directed = [float(o) / distance * 2 * math.tanh(distance / 2) for o in offset]
+    return torch.tensor([*directed, min(distance, 4.0), *enlarged])
 
 
-def heard(p: Named, name: str, senders: list[tuple[Tensor, Tensor]], receiver: Tensor) -> Tensor:
+def heard(p: Named, name: str, senders: list[tuple[Tensor, Tensor]], receiver: Tensor, near: float | None) -> Tensor:
     """Pool over senders (offset, features), a softmax in each channel; nothing without senders; then the value."""
     width = len(p[f"{name}.value.bias"])
     values, logits = [], []
     for offset, features in senders:
-        x = linear(p, f"{name}.from_offset", squash(offset))
+        x = linear(p, f"{name}.from_offset", squash(offset, near))
         if len(features):
             x = x + linear(p, f"{name}.from_sender", features)
         if len(receiver):
@@ -67,7 +69,7 @@ def cut(layout: list, x: Tensor) -> dict[str, list[tuple[Tensor, Tensor]]]:
     return groups
 
 
-def ego(p: Named, name: str, layout: list, x: Tensor, extra: Tensor | None) -> Tensor:
+def ego(p: Named, name: str, layout: list, x: Tensor, extra: Tensor | None, near: float | None) -> Tensor:
     groups = cut(layout, x)
     own = torch.cat([rest for group in layout if not group[3] for _, rest in groups[group[0]]])
     own = own if extra is None else torch.cat([own, extra])
@@ -80,9 +82,11 @@ def ego(p: Named, name: str, layout: list, x: Tensor, extra: Tensor | None) -> T
             if g not in (*AGENTS, *DEAF):
                 for mate in mates:
                     told = [(other - place, features) for other, features in groups[mate]]
-                    rest = torch.cat([rest, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, _own(groups[g], place))])
+                    rest = torch.cat(
+                        [rest, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, _own(groups[g], place), near)]
+                    )
             senders.append((place, rest))
-        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own))
+        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own, near))
     return torch.cat(parts)
 
 
@@ -90,7 +94,17 @@ def _own(group: list[tuple[Tensor, Tensor]], place: Tensor) -> Tensor:
     return next(rest for where, rest in group if where is place)
 
 
-def world(p: Named, name: str, layout: list, x: Tensor, action: Tensor, agent: int, agents: int, joint: bool) -> Tensor:
+def world(
+    p: Named,
+    name: str,
+    layout: list,
+    x: Tensor,
+    action: Tensor,
+    agent: int,
+    agents: int,
+    joint: bool,
+    near: float | None,
+) -> Tensor:
     groups = cut(layout, x)
     names, count = [], 0
     for group in layout:
@@ -124,7 +138,7 @@ def world(p: Named, name: str, layout: list, x: Tensor, action: Tensor, agent: i
                 if g not in DEAF:
                     for mate in names:
                         told = [(other - place, features) for other, features, _ in told_of[mate]]
-                        whole = torch.cat([whole, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, rest)])
+                        whole = torch.cat([whole, heard(p, f"{name}.heard.of_{g}_from_{mate}", told, rest, near)])
                 senders.append((place - me[0], whole))
-        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own))
+        parts.append(heard(p, f"{name}.edges.of_{g}", senders, own, near))
     return torch.cat(parts)

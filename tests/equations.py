@@ -94,7 +94,8 @@ class Equations:
     def entity_output(self, kind: str, layers: Layers, observations: Tensor, agent: int) -> Tensor:
         network = getattr(self.modules[agent], kind)
         p = dict(zip(dict(network.named_parameters()), layers, strict=True))
-        seen = [entities.ego(p, "ego", network.layout, x, None) for x in observations]
+        near = self.config.actor_settings.get("near")
+        seen = [entities.ego(p, "ego", network.layout, x, None, near) for x in observations]
         if self.config.actor == "entity":
             return entities.layers(p, "layers", seen[-1])
         encoded = torch.stack([entities.layers(p, "encoder", x).clamp(min=0.0) for x in seen])
@@ -105,14 +106,14 @@ class Equations:
     def entity_critic(self, layers: Layers, x: Tensor, u: Tensor, agent: int) -> Tensor:
         network = self.modules[agent].critic
         p = dict(zip(dict(network.named_parameters()), layers, strict=True))
-        values = []
+        values, near = [], self.config.critic_settings.get("near")
         for c in range(network.num_critics):
             if self.config.central_critic:
                 joint = "joint_action" in self.config.critic_sees
                 count = len(self.agents)
-                view = entities.world(p, f"views.{c}", network.state_layout, x, u, agent, count, joint)
+                view = entities.world(p, f"views.{c}", network.state_layout, x, u, agent, count, joint, near)
             else:
-                view = entities.ego(p, f"views.{c}", network.state_layout, x, u)
+                view = entities.ego(p, f"views.{c}", network.state_layout, x, u, near)
             values.append(entities.layers(p, f"layers.{c}", view))
         return torch.cat(values)
 

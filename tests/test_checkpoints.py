@@ -11,7 +11,10 @@ import rllib_maobs as maobs
 from rllib_maobs.checkpoints import find_checkpoint, saved_networks
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
-ENTITIES = {"actor": "entity", "critic": "entity", "critic_state": "world", "other_agents_actions": "joint"}
+ENTITIES = {
+    **{"actor": "entity", "critic": "entity", "critic_state": "world", "other_agents_actions": "joint"},
+    **{"actor_settings": {"near": 0.2}, "critic_settings": {"near": 0.2}},
+}
 
 
 def spec_of(env: str, **changes: Any) -> TrialSpec:
@@ -79,11 +82,20 @@ def test_policies_of_their_own_start_from_the_one_that_all_shared(smaller: Path)
     assert (states["agent_0"]["actor.layers.0.weight"] == states["agent_2"]["actor.layers.0.weight"]).all()
 
 
+def test_the_same_weights_as_another_network_are_warned_of(smaller: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("WARNING", "rllib_maobs"):
+        saved_networks(validated(spec_of("maobs/spread-6a")), smaller)
+    assert not caplog.text
+    with caplog.at_level("WARNING", "rllib_maobs"):
+        saved_networks(validated(spec_of("maobs/spread-3a", training={"critic_settings": {"near": 0.5}})), smaller)
+    assert "had critic_settings={'near': 0.2}, here {'near': 0.5}, with which the same weights may be" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("env", "changes", "message"),
     [
-        ("spread-6a", {"training": {"actor_settings": {"edge": 16}}}, "shape .32, 3., here .16, 3."),
-        ("spread-3a", {"training": {"actor": "mlp"}}, "shape .64, 100., here .64, 18."),
+        ("spread-6a", {"training": {"actor_settings": {"edge": 16}}}, "shape .32, 5., here .16, 3."),
+        ("spread-3a", {"training": {"actor": "mlp", "actor_settings": {}}}, "shape .64, 100., here .64, 18."),
         ("obstacle-predator-prey", {}, "of another kind or task than those of maddpg on maobs/obstacle-predator-prey"),
         ("spread-3a", {"algorithm": "facmac"}, r"has no networks for \['mixer'\]; it has those of \['all'\]."),
     ],

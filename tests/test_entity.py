@@ -39,10 +39,13 @@ def permuted(layout: Layout, vector: Tensor, name: str, order: list[int]) -> Ten
 
 
 @pytest.mark.parametrize(("name", "order"), [("target", [2, 0, 1]), ("obstacle", [1, 0]), ("agent", [1, 0])])
+@pytest.mark.parametrize("near", [None, 0.2])
 @pytest.mark.parametrize("actor", [EntityActor, EntityLSTMActor])
-def test_permuting_what_an_agent_sees_changes_no_action(actor: type, name: str, order: list[int]) -> None:
+def test_permuting_what_an_agent_sees_changes_no_action(
+    actor: type, near: float | None, name: str, order: list[int]
+) -> None:
     torch.manual_seed(0)
-    net = actor(OBSERVATION, 2).double()
+    net = actor(OBSERVATION, 2, near=near).double()
     obs = torch.randn(50, 4, 18).double()
     other = permuted(OBSERVATION, obs, name, order)
     act = net.unroll if actor is EntityLSTMActor else lambda window: (net(window[:, -1]), None)
@@ -76,6 +79,8 @@ def test_directions_are_right_in_single_precision() -> None:
     distance = (exact.square().sum(-1, keepdim=True) + 1e-12).sqrt()
     expected = torch.cat([exact / distance * 2.0 * torch.tanh(distance / 2.0), distance.clamp(max=4.0)], dim=-1)
     torch.testing.assert_close(squashed(offset).double(), expected, atol=1e-6, rtol=0.0)
+    enlarged = torch.cat([expected, exact / (distance + 0.2)], dim=-1)
+    torch.testing.assert_close(squashed(offset, near=0.2).double(), enlarged, atol=1e-6, rtol=0.0)
 
 
 def test_nobody_around_is_heard_as_nothing() -> None:
@@ -100,7 +105,7 @@ def test_far_off_things_and_speeds_do_not_blow_up() -> None:
 @pytest.mark.parametrize("num_agents", [1, 2, 6])
 def test_a_trained_agent_acts_in_teams_of_any_size(ray_session: None, tmp_path: Path, num_agents: int) -> None:
     """Lifted out in three lines, with the layout of the other team; one that has none gets the module's own."""
-    config = small_config("maddpg").training(**ENTITY)
+    config = small_config("maddpg").training(**ENTITY, actor_settings={"near": 0.2})
     config.multi_agent(policies={"all"}, policy_mapping_fn=lambda agent, *a, **k: "all")
     algo = config.build_algo()
     algo.train()
@@ -190,6 +195,10 @@ class Blind(maobs.MAObsEnv):
             r"say|need an observation that says",
         ),
         (lambda c: c.training(actor_settings={"edge": 0}), r"EntityActor: edge=0 is illegal; legal: an integer >= 1"),
+        (
+            lambda c: c.training(critic_settings={"near": 0}),
+            r"EntityCritic: near=0 is illegal; legal: a number > 0 or None",
+        ),
     ],
 )
 def test_layouts_that_do_not_do_are_refused(ray_session: None, change: Any, message: str) -> None:

@@ -78,6 +78,7 @@ def learned_prey(config: maobs.JointConfig) -> maobs.JointConfig:
 
 TD3 = {"twin_critics": True, "target_noise": 0.2, "target_noise_clip": 0.3}
 ENTITY = {"actor": "entity", "critic": "entity", "critic_state": "world"}
+NEAR = {"actor_settings": {"near": 0.2}, "critic_settings": {"near": 0.5}}
 OTHERS = ("replay", "current", "joint")
 CARRIED = "h and c stored"
 # Algorithm, settings, further changes; the name of the case.
@@ -114,6 +115,8 @@ CASES: dict[str, tuple[str, dict[str, Any], list[Any]]] = {
     **{f"{a}, entities, TD3": (a, {**ENTITY, **TD3}, []) for a in ("iddpg", "maddpg")},
     **{f"{a}, entities, discrete": (a, ENTITY, [discrete]) for a in ("maddpg-l", "facmac")},
     **{f"{a}, entities, learned prey": (a, ENTITY, [learned_prey]) for a in ("iddpg", "maddpg")},
+    **{f"{a}, entities seen from near": (a, {**ENTITY, **NEAR}, []) for a in ("iddpg", "maddpg")},
+    "maddpg, LSTM over entities seen from near": ("maddpg", {**ENTITY, **NEAR, "actor": "entity-lstm"}, []),
     "facmac own, entities": ("facmac", {**ENTITY, "critic_source": "own"}, []),
     "maddpg, LSTM over entities": ("maddpg", {**ENTITY, "actor": "entity-lstm"}, []),
     "qmix, LSTM over entities, one policy": ("qmix", {"actor": "entity-lstm"}, [one_policy]),

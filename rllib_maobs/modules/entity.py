@@ -24,22 +24,29 @@ from rllib_maobs.modules.layers import mlp
 from rllib_maobs.options import Range
 
 Width = Annotated[int, Range(1)]
+Near = Annotated[float, Range(0.0, exclusive=True)] | None
 _FAR = 4.0  # distances are capped here, so that far-off states can't blow up a value
 _CLAMP = 2.0  # and so are an agent's own numbers
 AGENTS = ("agent", "predator")
 DEAF = ("obstacle",)
 
 
-def squashed(offset: Tensor) -> Tensor:
+def squashed(offset: Tensor, near: Near = None) -> Tensor:
     """What networks see of an offset `(..., D)`: its direction times 2 tanh(distance / 2), and the distance up to 4.
 
+    Args:
+        offset: Of a sender from a receiver.
+        near: A distance at which small things matter. With it they see the offset once more, divided by
+            (distance + near): as if through a magnifying glass, which shows a tenth of `near` ten times as large.
+
     Returns:
-        `(..., D + 1)`.
+        `(..., D + 1)`, with `near` `(..., 2 D + 1)`.
     """
     distance = (offset.square().sum(-1, keepdim=True) + 1e-12).sqrt()
     # 2 tanh(d / 2) by way of the sigmoid: compiled, torch's own tanh takes three times as long.
     scale = (4.0 * torch.sigmoid(distance) - 2.0) / distance
-    return torch.cat([offset * scale, distance.clamp(max=_FAR)], dim=-1)
+    close = [] if near is None else [offset / (distance + near)]
+    return torch.cat([offset * scale, distance.clamp(max=_FAR), *close], dim=-1)
 
 
 class Edge(nn.Module):
@@ -50,12 +57,13 @@ class Edge(nn.Module):
         sender: Numbers that a sender has besides its place; 0 for none.
         receiver: Numbers that a receiver has besides; 0 for none.
         width: Channels.
+        near: See `squashed`.
     """
 
-    def __init__(self, space: int, sender: int, receiver: int, width: int) -> None:
+    def __init__(self, space: int, sender: int, receiver: int, width: int, near: Near = None) -> None:
         super().__init__()
-        self.width = width
-        self.from_offset = nn.Linear(space + 1, width)
+        self.width, self.near = width, near
+        self.from_offset = nn.Linear(space + 1 if near is None else 2 * space + 1, width)
         self.from_sender = nn.Linear(sender, width, bias=False) if sender else None
         self.from_receiver = nn.Linear(receiver, width, bias=False) if receiver else None
         self.logit, self.value = nn.Linear(width, width), nn.Linear(width, width)
@@ -87,7 +95,7 @@ class Edge(nn.Module):
             others = others + self.from_receiver(receiver).unsqueeze(-2)
         if self.from_sender is not None and sender is not None:
             others = others + self.from_sender(sender).unsqueeze(-3)
-        pairs = torch.relu(F.linear(squashed(offset), self.from_offset.weight) + others)  # (..., R, S, W)
+        pairs = torch.relu(F.linear(squashed(offset, self.near), self.from_offset.weight) + others)  # (..., R, S, W)
         logits = F.linear(pairs, self.logit.weight)
         if absent is not None:
             logits = logits - 1e9 * absent.unsqueeze(-1)
@@ -110,13 +118,20 @@ class Ego(nn.Module):
         edge: Width of the edges.
         agents: Names of the groups that are agents.
         deaf: Names of the groups that do not hear the agents.
+        near: A distance at which offsets are seen once more, enlarged (`squashed`); None: not.
 
     Raises:
         ValueError: If the layout has no group with a position; shows how to write one.
     """
 
     def __init__(
-        self, layout: Layout, extra: int, edge: int, agents: Sequence[str] = AGENTS, deaf: Sequence[str] = DEAF
+        self,
+        layout: Layout,
+        extra: int,
+        edge: int,
+        agents: Sequence[str] = AGENTS,
+        deaf: Sequence[str] = DEAF,
+        near: Near = None,
     ) -> None:
         super().__init__()
         self.layout = layout
@@ -132,14 +147,14 @@ class Ego(nn.Module):
         rest = {group.name: group.size - group.position for group in around}
         self.heard = nn.ModuleDict(
             {
-                _key(name, mate.name): Edge(space, rest[mate.name], rest[name], edge)
+                _key(name, mate.name): Edge(space, rest[mate.name], rest[name], edge, near)
                 for name in self.listeners
                 for mate in self.mates
             }
         )
         told = {name: len(self.mates) * edge if name in self.listeners else 0 for name in self.around}
         self.edges = nn.ModuleDict(
-            {_key(name): Edge(space, rest[name] + told[name], own, edge) for name in self.around}
+            {_key(name): Edge(space, rest[name] + told[name], own, edge, near) for name in self.around}
         )
         self.size = own + edge * len(self.around)
 
@@ -198,13 +213,20 @@ class World(nn.Module):
         num_agents: N.
         edge: Width of the edges.
         deaf: Names of the groups that do not hear the agents.
+        near: A distance at which offsets are seen once more, enlarged (`squashed`); None: not.
 
     Raises:
         ValueError: If the layout has no positions, or its first groups are not N agents.
     """
 
     def __init__(
-        self, state_layout: Layout, action_layout: Layout, num_agents: int, edge: int, deaf: Sequence[str] = DEAF
+        self,
+        state_layout: Layout,
+        action_layout: Layout,
+        num_agents: int,
+        edge: int,
+        deaf: Sequence[str] = DEAF,
+        near: Near = None,
     ) -> None:
         super().__init__()
         around = [group for group in state_layout if group.position]
@@ -222,12 +244,16 @@ class World(nn.Module):
         rest = {g.name: sender if g.name in names else g.size - g.position for g in around}
         self.listeners = [name for name in self.around if name not in (*names, *deaf)]
         self.heard = nn.ModuleDict(
-            {_key(name, mate): Edge(space, rest[mate], rest[name], edge) for name in self.listeners for mate in names}
+            {
+                _key(name, mate): Edge(space, rest[mate], rest[name], edge, near)
+                for name in self.listeners
+                for mate in names
+            }
         )
         told = {name: len(names) * edge if name in self.listeners else 0 for name in self.around}
         own = agent + self.action_size
         self.edges = nn.ModuleDict(
-            {_key(name): Edge(space, rest[name] + told[name], own, edge) for name in self.around}
+            {_key(name): Edge(space, rest[name] + told[name], own, edge, near) for name in self.around}
         )
         self.size = own + edge * len(self.around)
 
@@ -291,6 +317,7 @@ class EntityActor(Actor):
         node: Width of the hidden layers after them.
         agents: Names of the groups that are agents.
         deaf: Names of the groups that do not hear the agents.
+        near: A distance at which offsets are seen once more, enlarged (`squashed`); None: not.
     """
 
     takes_groups: ClassVar[bool] = True
@@ -303,9 +330,10 @@ class EntityActor(Actor):
         node: Width = 64,
         agents: Sequence[str] = AGENTS,
         deaf: Sequence[str] = DEAF,
+        near: Near = None,
     ) -> None:
         super().__init__(layout, num_outputs)
-        self.ego = Ego(layout, 0, edge, agents, deaf)
+        self.ego = Ego(layout, 0, edge, agents, deaf, near)
         self.layers = mlp((self.ego.size, node, node, num_outputs))
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -324,6 +352,7 @@ class EntityLSTMActor(LSTMActor):
         cell_size: H, size of h and c.
         agents: Names of the groups that are agents.
         deaf: Names of the groups that do not hear the agents.
+        near: A distance at which offsets are seen once more, enlarged (`squashed`); None: not.
     """
 
     takes_groups: ClassVar[bool] = True
@@ -337,8 +366,9 @@ class EntityLSTMActor(LSTMActor):
         cell_size: Width = 64,
         agents: Sequence[str] = AGENTS,
         deaf: Sequence[str] = DEAF,
+        near: Near = None,
     ) -> None:
-        ego = Ego(layout, 0, edge, agents, deaf)
+        ego = Ego(layout, 0, edge, agents, deaf, near)
         super().__init__(flat(node), num_outputs, (node, node), cell_size=cell_size)
         self.layout, self.ego = layout, ego
         self.encoder = mlp((ego.size, node, node))
@@ -363,6 +393,7 @@ class EntityCritic(Critic):
         node: Width of the hidden layers after them.
         agents: Names of the groups that are agents, in an observation.
         deaf: Names of the groups that do not hear the agents.
+        near: A distance at which offsets are seen once more, enlarged (`squashed`); None: not.
     """
 
     asks_whose: ClassVar[bool] = True
@@ -377,12 +408,13 @@ class EntityCritic(Critic):
         node: Width = 64,
         agents: Sequence[str] = AGENTS,
         deaf: Sequence[str] = DEAF,
+        near: Near = None,
     ) -> None:
         super().__init__(state_layout, action_layout, num_critics, num_agents)
         views: list[World | Ego] = [
-            World(state_layout, action_layout, num_agents, edge, deaf)
+            World(state_layout, action_layout, num_agents, edge, deaf, near)
             if num_agents
-            else Ego(state_layout, layout_size(action_layout), edge, agents, deaf)
+            else Ego(state_layout, layout_size(action_layout), edge, agents, deaf, near)
             for _ in range(num_critics)
         ]
         self.views = nn.ModuleList(views)
