@@ -4,8 +4,8 @@
     python tuned_examples/spread9a_networks.py --quick   # MADDPG with each of the networks, one seed
     python tuned_examples/spread9a_networks.py --help
 
-Not in the paper. Batches are smaller than with three agents, actions regularised and contacts at the task's own price,
-as in `spread9a.py`; and trainings are shorter: an update takes several times as long.
+Not in the paper. Batches are smaller than with three agents, actions regularised, contacts at the task's own price and
+entities seen once more from near; and trainings are shorter: an update takes several times as long.
 """
 
 from dataclasses import replace
@@ -13,12 +13,16 @@ from dataclasses import replace
 from spread3a_networks import experiment as three_agents
 
 TRAINING = {"reward_mode": "mean"}
+NEAR = {"actor_settings": {"near": 0.2}, "critic_settings": {"near": 0.2}}
 
 experiment = replace(
     three_agents,
     name="spread-9a-networks",
     env="maobs/spread-9a",
-    variants={row: {**settings, "train_env_config": TRAINING} for row, settings in three_agents.variants.items()},
+    variants={
+        row: {**settings, "train_env_config": TRAINING, **(NEAR if row.endswith("-entity") else {})}
+        for row, settings in three_agents.variants.items()
+    },
     stop_timesteps=40_000,
     training={**three_agents.training, "train_batch_size_per_learner": 64, "action_regularization": 0.01},
 )
