@@ -19,15 +19,18 @@ experiment = Experiment(
             "algorithm": "maddpg",
             "actor": "entity",
             "critic": "entity",
+            "actor_settings": {"near": 0.2},
+            "critic_settings": {"near": 0.2},
             "critic_state": "world",
             "other_agents_actions": "joint",
             "one_policy": True,
             "actor_lr": decayed(5e-4),
             "critic_lr": decayed(1e-3),
-            "gamma": 0.95,
+            "gamma": 0.8,  # short sight: values that span many steps hide the last centimetres and contacts
             "tau": 0.01,
             "train_batch_size_per_learner": 128,
             "updates_per_env_step": 1 / 8,
+            "action_regularization": 0.01,  # without it a team may run away for good, its actions all at the limit
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.05),
@@ -35,6 +38,7 @@ experiment = Experiment(
             # Training is stricter with contacts; scores are those of the task's own reward.
             "train_env_config": {
                 "reward_mode": "mean",
+                "matching": "one_to_one",
                 "agent_collision_penalty": 3.0,
                 "obstacle_collision_penalty": 3.0,
             },
