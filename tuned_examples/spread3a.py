@@ -35,7 +35,8 @@ experiment = Experiment(
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.05),
             "env_config": {"action_mode": "force"},
-            # Training is stricter with contacts; scores are those of the task's own reward.
+            # Scores are those of the task's own reward. Training is stricter with contacts, and gives everyone a target
+            # of its own: short-sighted ones would wait beside one that is taken.
             "train_env_config": {
                 "reward_mode": "mean",
                 "matching": "one_to_one",

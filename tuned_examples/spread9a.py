@@ -35,8 +35,8 @@ experiment = Experiment(
             "num_steps_sampled_before_learning_starts": 5_000,
             "exploration": fading(epsilon=0.1, noise=0.2, final=0.02),
             "env_config": {"action_mode": "force"},
-            # Scores are those of the task's own reward: the sum, with contacts at a third of this price, and targets that
-            # count for whoever is nearest. Short-sighted agents need one of their own, or the second one waits.
+            # Scores are those of the task's own reward. Training is stricter with contacts, and gives everyone a target
+            # of its own: short-sighted ones would wait beside one that is taken.
             "train_env_config": {
                 "reward_mode": "mean",
                 "matching": "one_to_one",
@@ -50,10 +50,8 @@ experiment = Experiment(
                 "stop_timesteps": 48_000,
                 "steps_per_iteration": 4_000,
                 "evaluation_duration": 20,
-                "train_env_config": {
-                    "reward_mode": "mean",
-                    "matching": "one_to_one",
-                },  # so few are for covering targets
+                # So few steps are for covering targets.
+                "train_env_config": {"reward_mode": "mean", "matching": "one_to_one"},
                 "torch_compile": True,
             },
         },
