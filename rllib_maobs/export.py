@@ -109,6 +109,7 @@ def export_agents(
     ending = path.suffix.lower()
     if ending not in FORMATS:
         raise ValueError(f"{str(path)!r} is no file to export to; legal are names that end in {' or '.join(FORMATS)}")
+    find_checkpoint(checkpoint)  # a wrong one is told of first
     if path.exists() and not replace:
         raise ValueError(f"{path} exists: remove it, choose another file, or say --force (replace=True)")
     if not path.absolute().parent.is_dir():

@@ -484,6 +484,8 @@ def test_the_command_writes_aside_and_replaces_nothing(
         return capsys.readouterr().err
 
     assert "agent_1.safetensors exists: remove it, choose another file, or say --force" in refused()
+    with pytest.raises(ValueError, match="'nowhere' is no checkpoint"):  # not that the file exists
+        export_agents("nowhere", path)
     assert "--output a.onnx does not end in .safetensors, as --format says" in refused("--output", "a.onnx")
     assert "there is no folder" in refused("--output", "no/a.safetensors")
     # Disk full: nothing half-written, and the old file stays.
