@@ -26,7 +26,7 @@ experiment = Experiment(
             "one_policy": True,
             "actor_lr": decayed(5e-4),
             "critic_lr": decayed(1e-3),
-            "gamma": 0.8,  # short sight: values that span many steps hide the last centimetres and contacts
+            "gamma": 0.8,  # short sight: values that span many steps hide small distances and contacts
             "tau": 0.01,
             "train_batch_size_per_learner": 64,
             "updates_per_env_step": 1 / 8,
