@@ -119,7 +119,7 @@ def written(path: Path, modules: dict[str, Any]) -> Path:
 KINDS: dict[str, dict[str, Any]] = {
     "mlp": {"normalize_observations": True, "hidden_sizes": [8]},
     "lstm": {"actor": "lstm", "seq_length": 2, "stored_state": True, "normalize_observations": True},
-    "entity": {"actor": "entity"},
+    "entity": {"actor": "entity", "actor_settings": {"near": 0.2}},
     "entity-lstm": {"actor": "entity-lstm", "seq_length": 2, "observation_layout": LAYOUT[:2]},
     "discrete": {"space": DISCRETE, "normalize_observations": True},
     "utility": {"space": DISCRETE, "cls": maobs.UtilityModule},
