@@ -4,8 +4,8 @@
     python tuned_examples/spread3a_networks.py --quick   # MADDPG with each of the networks, one seed
     python tuned_examples/spread3a_networks.py --help
 
-Not in the paper. All rows have one budget, and the settings of the row "maddpg-entity" of `spread3a.py`: one policy
-for all agents, short training episodes, 32 copies, one update for eight env steps.
+Not in the paper. All rows have one budget and the same settings: one policy for all agents, short training episodes, 32
+copies, one update for eight env steps, gamma 0.95, and targets that count for whoever is nearest, as in the task.
 """
 
 from typing import Any
