@@ -109,13 +109,13 @@ def export_agents(
     ending = path.suffix.lower()
     if ending not in FORMATS:
         raise ValueError(f"{str(path)!r} is no file to export to; legal are names that end in {' or '.join(FORMATS)}")
-    find_checkpoint(checkpoint)  # a wrong one is told of first
+    if missing := [name for name in NEEDED[ending] if find_spec(name) is None]:
+        raise ImportError(f'{ending} files need {", ".join(missing)}: pip install -c constraints.txt -e ".[export]"')
+    find_checkpoint(checkpoint)  # before the file: one that is there is not what is wrong with a wrong checkpoint
     if path.exists() and not replace:
         raise ValueError(f"{path} exists: remove it, choose another file, or say --force (replace=True)")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"there is no folder {path.absolute().parent} for {path.name}")
-    if missing := [name for name in NEEDED[ending] if find_spec(name) is None]:
-        raise ImportError(f'{ending} files need {", ".join(missing)}: pip install -c constraints.txt -e ".[export]"')
     source, description = _source(checkpoint, agent, ending)
     if ending == ".onnx":
         write_aside(path, _onnx(source, description))
