@@ -30,6 +30,7 @@ from scipy.stats import bootstrap
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
 from rllib_maobs.experiment.baselines import play_many, task_options
 from rllib_maobs.experiment.tables import format_table
+from rllib_maobs.orca import import_pyrvo
 from rllib_maobs.paths import local
 from rllib_maobs.play import parse_options, play
 from rllib_maobs.policies import BASELINES, make_policy, saved_options, trained_on
@@ -94,6 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         check_arguments(args.episodes, sizes, files, paths, parse_options(pairs))
         recorder = Recorder(args.record) if args.record else None
+        if args.baselines is not BASELINES and "orca" in args.baselines:
+            import_pyrvo()  # who asks for it does not want it left out
         jobs = [job for path in paths for job in jobs_of(path, args.env, sizes, parse_options(pairs), args.seed)]
     except (ValueError, ImportError) as error:
         parser.error(str(error))
@@ -184,8 +187,8 @@ def jobs_of(
     ] or [scenario]
     for each in scenarios:
         vec = VectorEnv(each)
-        vec.reset(seed=seed)  # whether everything fits into the room
         make_policy(vec, checkpoint, seed)
+        vec.reset(seed=seed)  # whether everything fits into the room
     return [(checkpoint, Task(task.env, asdict(each.options))) for each in scenarios]
 
 

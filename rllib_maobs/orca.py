@@ -17,6 +17,19 @@ _SIGHT, _MAX_NEIGHBORS = 3.0, 10
 _NUDGE = 1e-2  # random part of the preferred speed: discs that meet exactly head-on would stop for good
 
 
+def import_pyrvo() -> Any:
+    """Return the library.
+
+    Raises:
+        ImportError: If it is not installed; says how to.
+    """
+    try:
+        import pyrvo
+    except ImportError as error:
+        raise ImportError('the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"') from error
+    return pyrvo
+
+
 class OrcaPolicy:
     """Optimal reciprocal collision avoidance, with an optimal assignment of agents to targets.
 
@@ -40,11 +53,7 @@ class OrcaPolicy:
         self._targets = env.world.index.get("target", slice(0, 0))
         if self._targets.stop - self._targets.start != len(env.agents):
             raise NotImplementedError(f"ORCA needs a target for each agent, and {env.scenario} has none")
-        try:
-            import pyrvo
-        except ImportError as error:
-            raise ImportError('the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"') from error
-        self._env, self._library, self._rng = env, pyrvo, np.random.default_rng(seed)
+        self._env, self._library, self._rng = env, import_pyrvo(), np.random.default_rng(seed)
         world = env.world
         solid = [g.name for g in world.groups if g.collides and not g.movable]
         self._solid = np.array([k for name in solid for k in range(world.num_bodies)[world.index[name]]], np.intp)

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from rllib_maobs.envs import SCENARIOS, MAObsParallelEnv, Recorder, parallel_env
+from rllib_maobs.envs.rendering import has_display
 from rllib_maobs.policies import CheckpointPolicy, Policy, make_policy, saved_options
 
 
@@ -54,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         saved = {name: value for name, value in saved_options(args.policy, args.env).items() if name not in options}
         env = parallel_env(args.env, render_mode=mode, **saved, **options)
         policy = make_policy(env.vector, args.policy, args.seed)
+        if mode == "human" and not has_display():
+            raise ValueError("there is no display for a window here: give --record FILE, or --no-window")
         recorder = Recorder(args.record) if args.record is not None else None
     except (ValueError, ImportError, NotImplementedError) as error:
         parser.error(str(error))

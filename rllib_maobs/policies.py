@@ -145,7 +145,10 @@ class CheckpointPolicy:
         module_of = {agent: trained.module_of(agent) for agent in env.agents}
         for agent, module_id in module_of.items():
             if module_id not in trained.modules:
-                raise ValueError(f"{trained.name} has no module for {agent}; it has {', '.join(trained.modules)}")
+                raise ValueError(
+                    f"{trained.name} has no module for {agent}; it has {', '.join(trained.modules)}. Teams of any size "
+                    f"are played by one policy for all, with entity networks"
+                )
         modules = {mid: trained.modules[mid]() for mid in sorted(set(module_of.values()))}
         # What observations begin with: the agent's number as a one-hot vector if it was trained so, else nothing.
         size = len(env.agents) if trained.agent_ids else 0

@@ -8,6 +8,7 @@ import pytest
 
 import rllib_maobs as maobs
 from rllib_maobs.evaluate import Task, baselines_of
+from rllib_maobs.evaluate import main as evaluate
 from rllib_maobs.policies import make_policy, play_episodes
 
 pytest.importorskip("pyrvo", reason="ORCA's library is not installed")
@@ -100,4 +101,8 @@ def test_where_there_is_none(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     monkeypatch.setitem(sys.modules, "pyrvo", None)
     assert baselines_of(Task("spread-3a", {})) == ["random", "heuristic"]
     said = capsys.readouterr().err
-    assert 'left out: the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"' in said
+    needs = 'the policy "orca" needs pyrvo: pip install -c constraints.txt -e ".[orca]"'
+    assert f"left out: {needs}" in said
+    with pytest.raises(SystemExit):  # who asks for it does not want it left out
+        evaluate(["results/none", "--baselines", "random,orca"])
+    assert needs in capsys.readouterr().err

@@ -51,6 +51,23 @@ def import_pygame() -> Any:
     return pygame
 
 
+def has_display() -> bool:
+    """Whether a window would be seen: without a display, pygame draws it where nobody looks.
+
+    A driver that `SDL_VIDEODRIVER` names is taken as meant.
+    """
+    pygame = import_pygame()
+    if os.environ.get("SDL_VIDEODRIVER"):
+        return True
+    try:
+        pygame.display.init()
+        return str(pygame.display.get_driver()) not in ("offscreen", "dummy")
+    except pygame.error:
+        return False
+    finally:
+        pygame.display.quit()
+
+
 def check_render_mode(mode: str | None) -> None:
     """Raise a ValueError for an unknown mode, and an ImportError if pictures cannot be drawn."""
     if mode is None:
