@@ -19,8 +19,8 @@ experiment = Experiment(
             "algorithm": "maddpg",
             "actor": "entity",
             "critic": "entity",
-            "actor_settings": {"near": 0.2},
-            "critic_settings": {"near": 0.2},
+            "actor_settings": {"near": 0.05},
+            "critic_settings": {"near": 0.05},
             "critic_state": "world",
             "other_agents_actions": "joint",
             "one_policy": True,
@@ -29,7 +29,7 @@ experiment = Experiment(
             "gamma": 0.8,  # short sight: values that span many steps hide small distances and contacts
             "tau": 0.01,
             "train_batch_size_per_learner": 128,
-            "updates_per_env_step": 1 / 8,
+            "updates_per_env_step": 1 / 4,
             "action_regularization": 0.01,  # without it a team may run away for good, its actions all at the limit
             "num_random_steps": 5_000,
             "num_steps_sampled_before_learning_starts": 5_000,
@@ -40,10 +40,10 @@ experiment = Experiment(
             "train_env_config": {
                 "reward_mode": "mean",
                 "matching": "one_to_one",
-                "agent_collision_penalty": 3.0,
-                "obstacle_collision_penalty": 3.0,
+                "agent_collision_penalty": 8.0,
+                "obstacle_collision_penalty": 8.0,
             },
-            "train_horizon": 25,
+            "train_horizon": 50,
             "num_envs_per_env_runner": 32,
             "stop_timesteps": 200_000,
             "quick": {
