@@ -264,10 +264,11 @@ def plot_curves(
         here = {policy: level[name] for policy, level in levels.items() if name in level}
         for (policy, level), style in zip(here.items(), _STYLES, strict=False):
             lines.setdefault(policy, axes.axhline(level, color="0.35", linestyle=style, linewidth=1.2))
-        if name == SCORE:
-            _scale_scores(axes, [*by_trial[name].dropna(), *here.values()])
         axes.set_xlabel("env steps")
-        axes.set_ylabel("score (return of the first agent)" if name == SCORE else LABELS[name])
+        axes.set_ylabel(LABELS[name])
+        if name == SCORE:
+            scaled = _scale_scores(axes, [*by_trial[name].dropna(), *here.values()])
+            axes.set_ylabel("score: return of the first agent" + (", logarithmic" if scaled else ""))
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.grid(alpha=0.3)
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
@@ -276,12 +277,12 @@ def plot_curves(
     figure.savefig(path, dpi=150)
 
 
-def _scale_scores(axes: Any, values: list[float]) -> None:
-    """Make the axis of scores logarithmic if they are all negative and differ much."""
+def _scale_scores(axes: Any, values: list[float]) -> bool:
+    """Make the axis of scores logarithmic if they are all negative and differ much; returns whether it did."""
     from matplotlib.ticker import FixedLocator
 
     if not values or max(values) >= 0 or min(values) > _MUCH * max(values):
-        return
+        return False
     best, worst = -max(values), -min(values)
     low, high = best / 1.25, worst * 1.25
     axes.set_yscale("function", functions=(lambda y: -np.log(np.maximum(-y, 1e-9)), lambda y: -np.exp(-y)))
@@ -290,6 +291,7 @@ def _scale_scores(axes: Any, values: list[float]) -> None:
     ticks = [-digit * 10.0**decade for decade in decades for digit in (1, 2, 5)]
     axes.yaxis.set_major_locator(FixedLocator([tick for tick in ticks if low <= -tick <= high]))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value <= -1 else f"{value:g}")
+    return True
 
 
 def write_report(
