@@ -109,7 +109,8 @@ def saved_networks(config: JointConfig, checkpoint: str | Path) -> dict[str, dic
                     f"The networks in {str(checkpoint)!r} are of another kind or task than those of {config.name} on "
                     f"{config.env}: {name} of policy {mid!r} has shape {there.get(name, 'none (it is not there)')}, "
                     f"here {expected.get(name, 'none (it is not there)')}. For teams of any size are those of "
-                    f'training(actor="entity", critic="entity").'
+                    f'training(actor="entity", critic="entity"), but for mixers, and critics of a joint action with '
+                    f"one agent."
                 )
     return states
 
@@ -122,8 +123,8 @@ def load_networks(algorithm: JointAlgorithm, checkpoint: str | Path) -> None:
     maobs.load_networks(algo, "results/spread-3a/maddpg-entity-seed0")
     ```
 
-    Optimisers and replay start anew; to go on with a run, restore it instead. Checkpoints are pickles: load those of
-    people you trust only.
+    Meant for a new algorithm: optimisers and replay are left as they are. To go on with a run, restore it instead.
+    Checkpoints are pickles: load those of people you trust only.
 
     Args:
         algorithm: One of this package's.
@@ -132,7 +133,8 @@ def load_networks(algorithm: JointAlgorithm, checkpoint: str | Path) -> None:
     Raises:
         ValueError: If it has other policies, or networks with other parameters.
     """
-    modules = algorithm.learner_group._learner.module
+    learner = algorithm.learner_group._learner
     for mid, state in saved_networks(algorithm.config, checkpoint).items():
-        modules[mid].unwrapped().set_state(state)
+        learner.module[mid].unwrapped().set_state(state)
+    learner._weights_seq_no += 1  # or runners that have had weights since would skip these
     algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=algorithm.learner_group, inference_only=True)

@@ -30,11 +30,14 @@ from scipy.stats import bootstrap
 from rllib_maobs.envs import SCENARIOS, Recorder, VectorEnv, make_scenario, make_vec, parallel_env
 from rllib_maobs.experiment.baselines import play_many, task_options
 from rllib_maobs.experiment.tables import format_table
+from rllib_maobs.memory import gigabytes, memory_of
 from rllib_maobs.orca import import_pyrvo
 from rllib_maobs.paths import local
 from rllib_maobs.play import parse_options, play
 from rllib_maobs.policies import BASELINES, make_policy, saved_options, trained_on
 
+# Of entity networks: what one copy with 200 agents took, 4.9 GB, by 200^3.
+_BYTES_OF_PAIRS = 612
 # What the table shows, in its order, and how; a task reports those that make sense for it.
 LABELS = {
     "return": ("return", "{:.1f}"),
@@ -187,6 +190,11 @@ def jobs_of(
     ] or [scenario]
     for each in scenarios:
         vec = VectorEnv(each)
+        if sizes and (needed := _BYTES_OF_PAIRS * len(vec.agents) ** 3) > (there := memory_of("cpu")):
+            raise ValueError(
+                f"a team of {len(vec.agents)} needs some {gigabytes(needed)} of memory, as every agent looks at every "
+                f"pair of others; this machine has {gigabytes(there)}"
+            )
         make_policy(vec, checkpoint, seed)
         vec.reset(seed=seed)  # whether everything fits into the room
     return [(checkpoint, Task(task.env, asdict(each.options))) for each in scenarios]
@@ -250,8 +258,9 @@ def evaluated(task: Task, policy: str, episodes: int, seed: int) -> pd.DataFrame
     Returns:
         A row for each episode: its measures, and `env`, `agents`, `options`, `policy`.
     """
-    print(f"{task.env}, {task.num_agents} agents: {policy} ...", file=sys.stderr, flush=True)
+    print(f"{task.env}, {task.num_agents} agents: {policy} ...", end=" ", file=sys.stderr, flush=True)
     rows = play_many(task.env, task.options, policy, episodes, seed)
+    print(f"return {rows['return'].mean():.1f}", file=sys.stderr, flush=True)
     labels = {"env": task.env, "agents": task.num_agents, "options": json.dumps(task.options), "policy": policy}
     return rows.assign(**labels)
 

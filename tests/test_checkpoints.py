@@ -4,11 +4,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import rllib_maobs as maobs
-from rllib_maobs.checkpoints import find_checkpoint, saved_networks
+from rllib_maobs.checkpoints import find_checkpoint, load_networks, saved_networks
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
 ENTITIES = {
@@ -74,6 +75,21 @@ def test_a_trial_starts_from_the_networks_of_a_smaller_team(smaller: Path, tmp_p
     trial.train()
     assert torch.equal(weights(trial)["actor.layers.0.weight"], started["actor.layers.0.weight"] + 1.0)
     trial.stop()
+
+
+def test_runners_get_networks_also_after_training(smaller: Path) -> None:
+    """RLlib's runners skip weights that are not newer than their own."""
+    config = spec_of("maobs/spread-3a", num_env_runners=1).build_config()
+    algo = config.build_algo()
+    for _ in range(2):
+        algo.train()
+    load_networks(algo, smaller)
+    there = algo.env_runner_group.foreach_env_runner(lambda runner: runner.get_state(), local_env_runner=False)
+    (weights_there,) = (state["rl_module"]["all"] for state in there)
+    mine = algo.learner_group._learner.module["all"].state_dict()
+    acting = {name for name in weights_there if name.startswith("actor.")}
+    assert acting and all(np.array_equal(weights_there[name], mine[name].numpy()) for name in acting)
+    algo.stop()
 
 
 def test_policies_of_their_own_start_from_the_one_that_all_shared(smaller: Path) -> None:

@@ -208,6 +208,45 @@ def test_layouts_that_do_not_do_are_refused(ray_session: None, change: Any, mess
         config.build_algo()
 
 
+def test_groups_of_any_names_have_networks_of_their_own() -> None:
+    """Names that differ in a dot, a hyphen or the word between two names are still two."""
+    for names in (("a.b", "a-b"), ("a-_b", "a.b"), ("a_from_b", "a"), ("x-f", "xfrom")):
+        layout = (Entities("self", 1, 4), *(Entities(name, 2, 3, 2) for name in names), Entities("agent", 2, 2, 2))
+        net, x = EntityActor(layout, 2), torch.randn(1, 4 + 2 * 6 + 4)
+        assert len(net.ego.edges) == 3 and len(net.ego.heard) == 2
+        before = net(x)
+        for index in (6, 12):  # the third number of each group
+            other = x.clone()
+            other[:, index] += 1.0
+            assert not torch.equal(before, net(other))
+
+
+def test_an_observation_of_places_alone() -> None:
+    layout = (Entities("target", 3, 2, 2), Entities("agent", 2, 2, 2))
+    x = torch.randn(5, 10)
+    net = EntityActor(layout, 2)
+    assert net(x).shape == (5, 2)
+    torch.testing.assert_close(net(permuted(layout, x, "target", [2, 0, 1])), net(x))
+    critic = EntityCritic(layout, (Entities("action", 1, 2),))
+    assert critic(x, torch.randn(5, 2)).shape == (5, 1)
+
+
+@pytest.mark.parametrize("setting", [{"agents": None}, {"agents": "agent"}, {"deaf": [1]}, {"deaf": 5}])
+def test_what_does_not_name_groups_is_refused(setting: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="is illegal; legal: a list of names of groups"):
+        EntityActor(OBSERVATION, 2, **setting)
+
+
+def test_a_layout_of_tuples_will_do_for_another_team(ray_session: None) -> None:
+    algo = small_config("maddpg").training(**ENTITY).build_algo()
+    module = algo.get_module("agent_0")
+    other = module.for_layout([("self", 1, 4), ("target", 0, 2, 2), ("obstacle", 1, 2, 2), ("agent", 0, 2, 2)])
+    assert other.forward_inference({"obs": torch.zeros(3, 6)})["actions"].shape[0] == 3
+    with pytest.raises(ValueError, match="legal is a list of groups"):
+        module.for_layout(5)
+    algo.stop()
+
+
 def test_spaces_stay_vectors(ray_session: None) -> None:
     """Entity networks need nothing of an environment but its layout."""
     config = small_config("maddpg").training(**ENTITY)

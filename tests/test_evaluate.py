@@ -178,6 +178,7 @@ def test_resized_tasks() -> None:
         (["--baselines", "orka"], "'orka' is illegal; legal: none, or some of random,heuristic,orca"),
         (["--num-agents", 0], "--num-agents 0 is illegal; legal: integers >= 1"),
         (["agent_range=0.2", "--num-agents", 12], "use fewer or smaller bodies"),
+        (["--num-agents", 1000], "a team of 1000 needs some 612.0 GB of memory"),
         (["num_agents=4", "--num-agents", 3], "--num-agents and num_agents=... say the same"),
         (["--csv", "FOLDER.x", "--json", "FOLDER.x"], "name the same file"),
         (["scenario=tunnel"], "scenario=... is no option of a task; legal are those of its class"),

@@ -37,11 +37,13 @@ def print_plan(name: str, args: Namespace, specs: Sequence[TrialSpec], note: str
     rows = {spec.algorithm: spec for spec in of_one_seed(specs)}
     count = args.num_samples if args.search else len(specs)
     named = ", ".join(args.algos if len(rows) > len(args.algos) else rows)
-    print(f"{name}: {count} trials, {named} with seed {', '.join(map(str, args.seeds))}")
+    print(f"{name}: {count} trial{'s' * (count != 1)}, {named} with seed {', '.join(map(str, args.seeds))}")
     if args.search:
         print(f"Optuna chooses their settings one after the other: {' '.join(args.sweep or [])}")
     elif len(rows) > len(args.algos):
         print(f"Each with what it takes of the sweep: {len(rows)} rows for each seed.")
+    if args.start_from:
+        print(f"Networks start from {args.start_from}")
     if note:
         print(note)
     pace: dict[str, Pace] = {}
@@ -120,8 +122,8 @@ def _measured(args: Namespace, specs: Sequence[TrialSpec], count: int) -> tuple[
     )
     free = "" if args.storage else f"; free disk: {shutil.disk_usage(args.results_dir).free / 1e6:,.0f} MB"
     return pace, (
-        f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation, without "
-        f"compiling.\n"
+        f"Measured with {at_once} at once in {format_time(time.monotonic() - start)}, with evaluation. Compiling "
+        f"is not in what follows.\n"
         f"Estimated: {'at most ' if args.search else ''}{total / 3600:.2f} hours for all, {at_once} at once.\n"
         f"Replay will take up to {megabytes:,.0f} MB of memory per trial, and twice that of disk in its two "
         f"checkpoints{free}."

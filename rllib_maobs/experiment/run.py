@@ -162,7 +162,7 @@ class Experiment:
             for spec in of_one_seed(specs):  # They differ in nothing else that could be wrong.
                 config = spec.build_config()
                 config.validate()
-                if spec.start_from and not args.resume:
+                if spec.start_from and (not args.resume or args.add_seeds or args.add_algos):
                     saved_networks(config, spec.start_from)
         except ValueError as error:
             parser.error(str(error))

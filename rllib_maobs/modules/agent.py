@@ -217,8 +217,9 @@ class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             A module that acts; it has copies of the weights, and no critic.
 
         Raises:
-            ValueError: If the network's parameters depend on the layout, as an MLP's do.
+            ValueError: If the layout is illegal, or the network's parameters depend on it, as an MLP's do.
         """
+        layout = as_layout(layout, None, "observation")
         size = layout_size(layout)
         settings = {**self.model_config, "observation_layout": [list(group) for group in layout]}
         other = type(self)(

@@ -11,7 +11,7 @@ of h over the senders, weighted in each channel by a softmax of a linear map of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,7 @@ from rllib_maobs.layout import Entities, Layout, flat, layout_size, split
 from rllib_maobs.modules.actors import ACTORS, Actor, LSTMActor
 from rllib_maobs.modules.critics import CRITICS, Critic
 from rllib_maobs.modules.layers import mlp
-from rllib_maobs.options import Range
+from rllib_maobs.options import Range, as_list
 
 Width = Annotated[int, Range(1)]
 Near = Annotated[float, Range(0.0, exclusive=True)] | None
@@ -137,6 +137,7 @@ class Ego(nn.Module):
         self.layout = layout
         around = [group for group in layout if group.position]
         check_entities(around, "an observation")
+        check_names(agents=agents, deaf=deaf)
         self.own = [group.name for group in layout if not group.position]
         own = layout_size(tuple(group for group in layout if not group.position)) + extra
         self.around = [group.name for group in around]
@@ -170,8 +171,9 @@ class Ego(nn.Module):
             groups, absent = self._never_empty(observation)
         else:
             groups = split(self.layout, observation)
-        own = torch.cat([groups[name].flatten(-2).clamp(-_CLAMP, _CLAMP) for name in self.own], dim=-1)
-        own = own if extra is None else torch.cat([own, extra], dim=-1)
+        parts = [groups[name].flatten(-2).clamp(-_CLAMP, _CLAMP) for name in self.own]
+        parts += [] if extra is None else [extra]
+        own = torch.cat(parts or [groups[self.around[0]].flatten(-2)[..., :0]], dim=-1)
         offsets = {name: _by_coordinate(groups[name][..., : self.position[name]]) for name in self.around}
         rest = {name: groups[name][..., self.position[name] :].clamp(-_CLAMP, _CLAMP) for name in self.around}
         messages = [own]
@@ -231,6 +233,7 @@ class World(nn.Module):
         super().__init__()
         around = [group for group in state_layout if group.position]
         check_entities(around, "a state")
+        check_names(deaf=deaf)
         self.layout, self.action_layout = state_layout, action_layout
         self.agents = leading(state_layout, num_agents)
         self.joint = sum(group.count for group in action_layout) == num_agents and num_agents > 1
@@ -428,8 +431,9 @@ class EntityCritic(Critic):
 
 
 def _key(*names: str) -> str:
-    """A name that a module may have, whatever groups are called."""
-    return "_from_".join(["of", *names]).replace(".", "-").replace("of_from_", "of_", 1)
+    """A name that a module may have, whatever groups are called; another one for other groups."""
+    plain = (name.replace("-", "--").replace(".", "-_").replace("from", "-f") for name in names)
+    return "of_" + "_from_".join(plain)
 
 
 def _by_coordinate(places: Tensor) -> Tensor:
@@ -473,6 +477,14 @@ def check_entities(around: Sequence[Entities], what: str) -> None:
             f'[("self", 1, 4), ("target", 3, 2, 2), ("agent", 2, 2, 2)]. Give observation_layouts (and with a '
             f'centralised critic critic_state="world" and state_layout) to config.training().'
         )
+
+
+def check_names(**settings: Any) -> None:
+    """Raises a ValueError if what should name groups does not list texts."""
+    for setting, names in settings.items():
+        listed = as_list(names)
+        if listed is None or not all(isinstance(name, str) for name in listed):
+            raise ValueError(f"{setting}={names!r} is illegal; legal: a list of names of groups, such as ['agent']")
 
 
 ACTORS.register("entity", EntityActor)
