@@ -10,6 +10,7 @@ import torch
 
 import rllib_maobs as maobs
 from rllib_maobs.checkpoints import find_checkpoint, load_networks, saved_networks
+from rllib_maobs.experiment.arguments import make_parser, parse, save_settings
 from rllib_maobs.experiment.trial import Trial, TrialSpec
 
 ENTITIES = {
@@ -75,6 +76,27 @@ def test_a_trial_starts_from_the_networks_of_a_smaller_team(smaller: Path, tmp_p
     trial.train()
     assert torch.equal(weights(trial)["actor.layers.0.weight"], started["actor.layers.0.weight"] + 1.0)
     trial.stop()
+
+
+def test_all_trials_of_a_run_start_from_one_checkpoint(
+    smaller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also those that begin when it is no longer the last one."""
+    parser, folder = make_parser("demo", ["maddpg"], 100), tmp_path / "new"
+    given = ["--results-dir", str(folder), "--from", str(smaller)]
+    args = parse(parser, "demo", given)
+    assert args.start_from == str(smaller / "checkpoint_000001")
+    (folder / "trial").mkdir(parents=True)
+    save_settings("demo", args)
+    for again in (str(smaller), str(smaller / "checkpoint_000001")):
+        later = parse(parser, "demo", ["--resume", *given[:-1], again])
+        assert later.start_from == args.start_from
+    with pytest.raises(SystemExit):
+        parse(parser, "demo", ["--resume", *given[:-1], str(smaller / "checkpoint_000000")])
+    assert f"--from: the original run has {args.start_from}" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        parse(parser, "demo", ["--results-dir", str(tmp_path / "other"), "--from", str(tmp_path)])
+    assert f"--from: {str(tmp_path)!r} is no checkpoint" in capsys.readouterr().err
 
 
 def test_runners_get_networks_also_after_training(smaller: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from rllib_maobs.checkpoints import find_checkpoint
 from rllib_maobs.experiment.claim import LOCK
 from rllib_maobs.experiment.rows import PAPER_HORIZON
 from rllib_maobs.experiment.rows import QUICK as QUICK_ROW
@@ -297,6 +298,11 @@ def parse(
         args = _with_stored_settings(parser, argv, {"lengthened_to": None, **stored})
     elif has_started(results_dir):
         parser.error(f"{place} is not empty: continue the run there with --resume, or choose another --results-dir")
+    elif args.start_from:
+        try:  # all trials start from the same one, also those that begin when it is no longer the last
+            args.start_from = str(find_checkpoint(args.start_from))
+        except ValueError as error:
+            parser.error(f"--from: {error}")
     args.results_dir, args.storage = results_dir, storage
     return args
 
@@ -320,6 +326,8 @@ def _with_stored_settings(
     parser.set_defaults(**stored)
     args = parser.parse_args(argv)
     args.resume = True
+    if args.start_from and stored["start_from"] and Path(args.start_from) == Path(stored["start_from"]).parent:
+        args.start_from = stored["start_from"]  # the trial whose checkpoint it was
     longer = args.stop_timesteps if args.stop_timesteps != stored["stop_timesteps"] else None
     args.stop_timesteps = stored["stop_timesteps"]
     for name, value in stored.items():
