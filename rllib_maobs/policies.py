@@ -284,13 +284,14 @@ def _fitting(env: VectorEnv, agent: str, module: Any, id_size: int) -> Any:
         return module
     try:
         if id_size or not hasattr(module, "for_layout"):
-            raise ValueError("its networks have one size")
+            raise ValueError("its networks act on one size")
         return module.for_layout(layout)
     except ValueError as error:
         if trained == here:
             return module
         raise ValueError(
-            f"{agent} observes ({here},) in {env.scenario}, but was trained on ({trained},). Networks that act in "
-            f'teams of any size are those of training(actor="entity"), without agent_id_input and '
+            f"{agent} observes ({here},) in {env.scenario}, but was trained on ({trained},): "
+            f"{str(error).rstrip('.')}. Networks that "
+            f'act in teams of any size are those of training(actor="entity"), without agent_id_input and '
             f"normalize_observations"
         ) from error

@@ -184,7 +184,10 @@ def test_resized_tasks() -> None:
         (["scenario=tunnel"], "scenario=... is no option of a task; legal are those of its class"),
         (["horzon=3"], "did you mean 'horizon'"),
         (["--env", "spread-4a"], "unknown scenario 'spread-4a'"),
-        (["--env", "obstacle-predator-prey"], "was trained on (18,)"),
+        (
+            ["--env", "obstacle-predator-prey"],
+            "was trained on (18,): EntityActor of this agent has parameters of other",
+        ),
         (["--csv", "FOLDER"], "exists: remove it, or choose another file"),
         (["--json", "FOLDER/no/x.json"], "there is no folder"),
     ],

@@ -307,7 +307,8 @@ def test_entity_networks_play_in_teams_of_another_size(entity_checkpoint, scenar
 def test_networks_of_one_size_say_so(entity_checkpoint, maddpg_checkpoint):
     path, _ = maddpg_checkpoint
     with pytest.raises(
-        ValueError, match=r"was trained on \(18,\)\. Networks that act in teams of any size are those of tr"
+        ValueError,
+        match=r"was trained on \(18,\): MLPActor of .* Networks that act in teams of any size are those of tr",
     ):
         make_policy(make_vec("spread-3a", num_obstacles=10), path)
 

@@ -232,7 +232,7 @@ class AgentModule(AnyPath, TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         if own != {name: tuple(p.shape) for name, p in other.acting.named_parameters()}:
             raise ValueError(
                 f"{type(self.acting).__name__} of this agent has parameters of other shapes for an observation of "
-                f"{[tuple(group) for group in layout]}: entity networks do not."
+                f"{[tuple(group) for group in layout]}: those of entity networks depend on the groups alone."
             )
         other.acting.load_state_dict(self.acting.state_dict())
         if list(self.normalizer.parameters()):
