@@ -19,6 +19,8 @@ experiment = Experiment(
             "algorithm": "maddpg",
             "actor": "entity",
             "critic": "entity",
+            "actor_settings": {"near": 0.05},
+            "critic_settings": {"near": 0.05},
             "critic_state": "world",
             "other_agents_actions": "joint",
             "one_policy": True,
