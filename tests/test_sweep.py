@@ -159,7 +159,10 @@ def test_the_plan_counts_the_trials(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     print_plan("demo", args, EXPERIMENT.specs(args))
     plan = capsys.readouterr().out
     assert "demo: 6 trials, iddpg with seed 1, 2\nEach with what it takes of the sweep: 3 rows" in plan
-    assert "6 measured" in plan and "iddpg,tau=0.2 " in plan
+    assert "6 measured" in plan and "iddpg,tau=0.2 " in plan and "start from" not in plan
+    args.start_from = "three/checkpoint_000001"
+    print_plan("demo", args, EXPERIMENT.specs(args))
+    assert "\nNetworks start from three/checkpoint_000001\n" in capsys.readouterr().out
     args = arguments("--algos", "iddpg", "--quick", "--search", "optuna", "--num-samples", "9")
     print_plan("demo", args, EXPERIMENT.specs(args))
     assert "demo: 9 trials, iddpg with seed 0\nOptuna chooses" in capsys.readouterr().out
